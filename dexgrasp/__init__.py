@@ -1,0 +1,1 @@
+"""dexgrasp: hand-agnostic, multi-finger grasping."""

@@ -1,0 +1,44 @@
+"""Rigid motions and frames. `a_T_b` maps b-coordinates into a; everything batches over leading axes."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def pose(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
+    """Join rotation and translation (m) into homogeneous matrices."""
+    top = torch.cat([rotation, translation.unsqueeze(-1)], dim=-1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], dim=-2)
+
+
+def inverse(a_T_b: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
+    """Return b_T_a of a rigid motion (transposed rotation, no linear solve)."""
+    rotation = a_T_b[..., :3, :3].transpose(-1, -2)
+    return pose(rotation, -(rotation @ a_T_b[..., :3, 3:]).squeeze(-1))
+
+
+def transform(a_T_b: Float[Tensor, "*b 4 4"], points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+    """Carry one point per motion from b to a (m)."""
+    return rotate(a_T_b, points) + a_T_b[..., :3, 3]
+
+
+def rotate(a_T_b: Float[Tensor, "*b 4 4"], vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+    """Carry one direction per motion from b to a."""
+    return (a_T_b[..., :3, :3] @ vectors.unsqueeze(-1)).squeeze(-1)
+
+
+def axis_angle(axis: Float[Tensor, "*b 3"], angle: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3 3"]:
+    """Return the rotation by `angle` (rad) about the unit vector `axis` (Rodrigues)."""
+    x, y, z = axis.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*axis.shape[:-1], 3, 3)
+    sine, cosine = torch.sin(angle)[..., None, None], torch.cos(angle)[..., None, None]
+    eye = torch.eye(3, dtype=axis.dtype, device=axis.device)
+    return eye + sine * cross + (1 - cosine) * (cross @ cross)
+
+
+def rotation_angle(a: Float[Tensor, "*b 3 3"], b: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
+    """Return the geodesic angle between rotations (rad), accurate near 0 and near pi."""
+    chord = torch.linalg.matrix_norm(a - b) / (2 * 2**0.5)
+    return 2 * torch.asin(chord.clamp(max=1.0))

@@ -1,0 +1,101 @@
+"""Grasps and what became of them."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from dexgrasp.batch import Batch
+
+
+@dataclass(frozen=True)
+class Grasps(Batch):
+    """N grasps of one hand; nothing here belongs to a representation.
+
+    The frame of `pose`, `contacts` and `normals` is the holder's: object frame in a grasp store, world frame in a
+    scene, camera frame in a view and in predictions.
+    """
+
+    pose: Float[Tensor, "N 4 4"]
+    """frame_T_base: the hand's base, m."""
+    joints: Float[Tensor, "N J"]
+    """Independent joints in the hand's order, rad (m where prismatic)."""
+    contacts: Float[Tensor, "N F 3"]
+    """Contact point of each fingertip, m; NaN where a finger does not touch or is not known to."""
+    normals: Float[Tensor, "N F 3"]
+    """Outward unit normal of the object at each contact; NaN as in `contacts`."""
+    finger: Int[Tensor, "N"]
+    """Index of the finger from which the grasp is told (0..F-1); -1 where none was chosen."""
+    object: Int[Tensor, "N"]
+    """Index of the object in its scene or set; -1 where unknown."""
+    quality: Float[Tensor, "N"]
+    """Epsilon quality of synthesised grasps; score (higher is better) of predicted ones."""
+
+    @classmethod
+    def build(
+        cls,
+        pose: Float[Tensor, "N 4 4"],
+        joints: Float[Tensor, "N J"],
+        fingers: int,
+        *,
+        finger: Tensor | None = None,
+        quality: Tensor | None = None,
+    ) -> "Grasps":
+        """Return grasps of which only pose and joints are known; contacts are NaN, object -1."""
+        count = len(pose)
+        unknown = pose.new_full((count, fingers, 3), float("nan"))
+        none = torch.full((count,), -1, dtype=torch.long, device=pose.device)
+        return cls(
+            pose=pose,
+            joints=joints,
+            contacts=unknown,
+            normals=unknown.clone(),
+            finger=none if finger is None else finger,
+            object=none.clone(),
+            quality=pose.new_zeros(count) if quality is None else quality,
+        )
+
+    def moved(self, a_T_b: Float[Tensor, "4 4"]) -> "Grasps":
+        """Carry grasps from frame b to frame a."""
+        motion = a_T_b.to(self.pose)
+        rotation = motion[:3, :3].T
+        return self.replace(
+            pose=motion @ self.pose,
+            contacts=self.contacts @ rotation + motion[:3, 3],
+            normals=self.normals @ rotation,
+        )
+
+
+class Reason(IntEnum):
+    """Why an attempt ended as it did, in the order in which they are tested."""
+
+    SUCCESS = 0
+    NO_GRASP = 1
+    """The network, or the collision filter behind it, offered no grasp."""
+    COLLIDED = 2
+    """The open hand touched table or objects on its way to the grasp."""
+    MISSED = 3
+    """After closing, the hand held nothing."""
+    TOPPLED = 4
+    """Closing pushed the object away or over, it was never lifted."""
+    SLIPPED = 5
+    """The object left the table and fell, or slid out while held."""
+    MULTIPLE = 6
+    """More than the one object was lifted."""
+
+
+@dataclass(frozen=True)
+class Outcomes(Batch):
+    """What a simulator saw of N executed grasps, each from the same initial scene of O objects."""
+
+    success: Bool[Tensor, "N"]
+    reason: Int[Tensor, "N"]
+    """A `Reason`."""
+    object: Int[Tensor, "N"]
+    """Index of the object that was held (or was touched first); -1 for none."""
+    height: Float[Tensor, "N"]
+    """Rise of that object's centre of mass at the end, m."""
+    final: Float[Tensor, "N O 4 4"]
+    """world_T_object of all objects at the end of each attempt, m."""

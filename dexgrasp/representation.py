@@ -1,0 +1,63 @@
+"""The Representation interface: how a network tells a grasp."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from dexgrasp.batch import Batch
+from dexgrasp.grasps import Grasps
+from dexgrasp.hand import Hand
+
+Prediction = dict[str, Tensor]
+"""Raw outputs of the heads by name; the first axis of each is the point."""
+
+
+@dataclass(frozen=True)
+class Targets(Batch):
+    """What the network shall say at N points."""
+
+    finger: Int[Tensor, "N"]
+    """0 = not graspable, 1..F = the finger that touches here."""
+    parameters: Float[Tensor, "N P"]
+    """The representation's numbers (continuous, not binned); anything finite where `finger` is 0."""
+    quality: Float[Tensor, "N"]
+    """Epsilon quality of the labelled grasp, 0 where there is none."""
+    encodable: Bool[Tensor, "N"]
+    """Whether the grasp can be told at all; False is never trained on."""
+
+
+class Representation(nn.Module, ABC):
+    """Encoder, heads, loss and decoder of one way to tell a grasp.
+
+    Constructor: ``(hand, channels, **options)``; `channels` is the size of the backbone's point features.
+    Points and normals are in one frame (the camera's in training); that frame is the grasps' too.
+    """
+
+    hand: Hand
+    size: int
+    """Number P of parameters."""
+
+    @abstractmethod
+    def encode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grasps: Grasps) -> Targets:
+        """Tell N grasps, each from the point where the finger `grasps.finger` touches; no network involved."""
+
+    @abstractmethod
+    def decode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], prediction: Prediction) -> Grasps:
+        """Return one grasp per point; `quality` is the score (probability of graspable), `finger` the likeliest.
+
+        The fields `contacts` and `normals` hold the point for that finger and NaN for the others.
+        """
+
+    @abstractmethod
+    def forward(self, features: Float[Tensor, "N C"]) -> Prediction:
+        """Run the heads on point features."""
+
+    @abstractmethod
+    def loss(self, prediction: Prediction, targets: Targets) -> dict[str, Tensor]:
+        """Return the loss terms by name, weighted, each a scalar; their sum is minimised."""
+
+    @abstractmethod
+    def as_prediction(self, targets: Targets) -> Prediction:
+        """Return the prediction that says exactly `targets`: what a perfect network would put out."""
