@@ -1,1 +1,34 @@
-"""dexgrasp: hand-agnostic, multi-finger grasping."""
+"""dexgrasp: hand-agnostic, multi-finger grasping.
+
+The public names below load on first use, so that ``import dexgrasp`` costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dexgrasp import quality
+    from dexgrasp.model import load_model
+    from dexgrasp.plugins import load_backbone, load_hand, load_representation
+
+__version__ = "0.1.0"
+__all__ = ["load_backbone", "load_hand", "load_model", "load_representation", "quality"]
+
+_HOMES = {
+    "load_hand": "dexgrasp.plugins",
+    "load_representation": "dexgrasp.plugins",
+    "load_backbone": "dexgrasp.plugins",
+    "load_model": "dexgrasp.model",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "quality":
+        return import_module("dexgrasp.quality")
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module 'dexgrasp' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -1,0 +1,82 @@
+"""The command line: ``python -m dexgrasp <command> [overrides | arguments]``."""
+
+import os
+import sys
+from importlib import import_module
+
+from dexgrasp.errors import DexgraspError
+
+PIPELINES = {
+    "dataset": "objects -> grasps -> scenes -> views -> labels",
+    "train": "train a network, evaluate it in physics, show the result",
+    "eval": "run a trained network (or the labels) in physics",
+    "predict": "grasps for one point cloud or depth image",
+    "fidelity": "how much of a grasp each representation keeps",
+    "benchmark": "speed of every stage",
+}
+"""Hydra apps: ``key=value`` overrides; config ``conf/<command>.yaml``."""
+
+TOOLS = {
+    "plugins": "list installed hands, representations and backbones",
+    "hand": "make or check a hand: hand init, hand check",
+    "report": "write the report of a run again",
+}
+"""Ordinary arguments."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command; return the exit status (2 for a user's error, 130 for Ctrl-C)."""
+    argv = sys.argv[1:] if argv is None else argv
+    command, rest = (argv[0], argv[1:]) if argv else ("--help", [])
+    try:
+        if command in ("-h", "--help", "help"):
+            print(usage())
+            return 0
+        if command in TOOLS:
+            return int(import_module(f"dexgrasp.commands.{command}").main(rest) or 0)
+        if command in PIPELINES:
+            return pipeline(command, rest)
+        from dexgrasp.plugins import unknown
+
+        raise unknown("command", command, [*PIPELINES, *TOOLS])
+    except DexgraspError as error:
+        print(f"dexgrasp {command}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\ndexgrasp {command}: interrupted", file=sys.stderr)
+        return 130
+
+
+def usage() -> str:
+    """Return the text of ``--help``."""
+    width = max(map(len, [*PIPELINES, *TOOLS]))
+    lines = ["usage: python -m dexgrasp <command> [key=value ... | arguments]", "", "pipelines (key=value):"]
+    lines += [f"  {name:{width}}  {text}" for name, text in PIPELINES.items()]
+    lines += ["", "tools:", *(f"  {name:{width}}  {text}" for name, text in TOOLS.items())]
+    return "\n".join(
+        [*lines, "", "`python -m dexgrasp <command> --help` lists its options and every installed choice."]
+    )
+
+
+def pipeline(command: str, overrides: list[str]) -> int:
+    """Run a Hydra app."""
+    import hydra
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    from dexgrasp import config
+
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises instead of printing and exiting: the wording is ours
+    config.register()
+    sys.argv = [f"dexgrasp {command}", *overrides]
+    start = hydra.main(version_base="1.3", config_path=str(config.conf_folder()), config_name=command)
+    try:
+        start(config.Task(command))()
+    except (HydraException, OmegaConfBaseException) as error:
+        print(f"dexgrasp {command}: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

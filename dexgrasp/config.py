@@ -1,0 +1,81 @@
+"""Hydra as the command line uses it: search path, the resolver `${package:...}`, one wrapper round every task."""
+
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from dexgrasp import plugins
+from dexgrasp.errors import DexgraspError
+
+
+def package(name: str) -> str:
+    """Resolve `${package:name}`: the folder of an installed package, found without importing it."""
+    folder = plugins.package_folder(name)
+    if folder is None:
+        raise DexgraspError(f"an installed package {name!r}", "none", "install the distribution that holds it")
+    return str(folder)
+
+
+# At import, so that it is there in every worker process that unpickles a task or a config.
+OmegaConf.register_new_resolver("package", package, replace=True)
+
+
+def conf_folder() -> Path:
+    """Return the folder of our own configs (inside the package in a wheel, beside it in a source tree)."""
+    folder = plugins.conf_folder("dexgrasp")
+    if folder is None:
+        raise DexgraspError("the folder conf of dexgrasp", "none", "reinstall dexgrasp")
+    return folder
+
+
+class PluginSearchPath(SearchPathPlugin):
+    """Appends the `conf/` of every installed plugin; as files, because `pkg://` would import the plugin."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for name, folder in plugins.conf_folders():
+            search_path.append(provider=name, path=f"file://{folder}")
+
+
+def register() -> None:
+    """Make Hydra know the plugins; call before Hydra starts."""
+    Plugins.instance().register(PluginSearchPath)
+
+
+class Task:
+    """What Hydra runs: a command's `main`, found by name so that it pickles to other processes."""
+
+    def __init__(self, command: str) -> None:
+        self.command = command
+        self.__name__ = command
+
+    def __call__(self, config: DictConfig) -> None:
+        main: Callable[[DictConfig], None] = import_module(f"dexgrasp.commands.{self.command}").main
+        place_urdf(config)
+        main(config)
+
+
+def place_urdf(config: DictConfig) -> None:
+    """Make a relative `hand.urdf` absolute: it is relative to the YAML, which lies in one of Hydra's folders."""
+    hand = OmegaConf.select(config, "hand")
+    urdf = OmegaConf.to_container(hand, resolve=False).get("urdf") if isinstance(hand, DictConfig) else None  # type: ignore[union-attr]
+    if not isinstance(urdf, str) or urdf.startswith(("${", "/", "~")):
+        return
+    folders = [
+        Path(source.path) / "hand"
+        for source in HydraConfig.get().runtime.config_sources
+        if source.schema == "file" and source.path
+    ]
+    found = next((folder / urdf for folder in folders if (folder / urdf).is_file()), None)
+    if found is None:
+        listed = ", ".join(map(str, folders))
+        raise DexgraspError(
+            f"the URDF {urdf!r} of hand {hand.get('name')!r} beside its YAML", f"none in {listed}", "check hand.urdf"
+        )
+    with open_dict(hand):
+        hand.urdf = str(found.resolve())
