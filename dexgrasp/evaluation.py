@@ -1,0 +1,238 @@
+"""Closed-loop evaluation: look, predict, choose, execute, remove, look again (METHOD section 5)."""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dexgrasp.geometry import inverse, rotation_angle
+from dexgrasp.grasps import Grasps, Reason
+from dexgrasp.hand import Hand
+from dexgrasp.objects import Object
+from dexgrasp.scene import View
+from dexgrasp.seeds import stream
+from dexgrasp.simulation.protocol import Protocol
+from dexgrasp.simulation.simulator import Simulator
+from dexgrasp.statistics import bootstrap_ratio, wilson
+
+Look = Callable[[Sequence[Object], Float[Tensor, "O 4 4"], int], View]
+"""Renders the objects at their poses; the last argument seeds camera and noise."""
+Predict = Callable[[View], Grasps]
+"""Returns grasps in the camera frame, best first."""
+Epsilon = Callable[[Object, Float[Tensor, "4 4"], Grasps], float]
+"""Returns the epsilon quality that one grasp (world frame) reaches on an object at a pose."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One executed (or missing) grasp."""
+
+    scene: int
+    number: int
+    success: bool
+    reason: str
+    target: str | None
+    """Object on which the predicted contact lies (ground truth, for the report only)."""
+    lifted: str | None
+    score: float | None
+    epsilon: float | None
+    seconds: dict[str, float]
+    """Wall-clock time of render, predict, execute."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One scene worked on until it is empty or the attempts are used up."""
+
+    scene: int
+    present: tuple[str, ...]
+    removed: tuple[str, ...]
+    attempts: tuple[Attempt, ...]
+    strips: tuple[dict[str, Any], ...] = field(default=(), repr=False)
+    """What a report needs to draw each attempt: poses, grasp, view."""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Which of the predicted grasps is executed."""
+
+    distance: float = 0.02
+    """A grasp within this distance (m) and angle of one that failed in this scene is passed over once."""
+    angle: float = 0.35
+    """rad"""
+
+
+def clear(
+    index: int,
+    objects: Sequence[Object],
+    poses: Float[Tensor, "O 4 4"],
+    hand: Hand,
+    look: Look,
+    predict: Predict,
+    simulator: Simulator,
+    protocol: Protocol,
+    policy: Policy,
+    seed: int,
+    epsilon: Epsilon | None = None,
+    draw: bool = False,
+) -> Episode:
+    """Clear one scene, at most ``protocol.attempts_per_object`` attempts per object.
+
+    Objects that leave the table count as present and are never removed. Poses are world_T_object.
+    """
+    names = tuple(item.name for item in objects)
+    present, poses = list(range(len(objects))), poses.clone()
+    removed: list[str] = []
+    attempts: list[Attempt] = []
+    strips: list[dict[str, Any]] = []
+    failed: list[Grasps] = []
+    budget = math.floor(protocol.attempts_per_object * len(objects))
+    while len(attempts) < budget and len(present) > protocol.leave:
+        began = time.perf_counter()
+        here = [objects[i] for i in present]
+        view = look(here, poses[present], int(stream(seed, "look", index, len(attempts)).integers(2**31)))
+        looked = time.perf_counter()
+        offered = predict(view)
+        predicted = time.perf_counter()
+        chosen = choose(offered.moved(view.world_T_camera), failed, policy)
+        if chosen is None:
+            attempts.append(_nothing(index, len(attempts), looked - began, predicted - looked))
+            continue
+        target = _target(chosen, view)
+        outcome = simulator.execute(here, poses[present], hand, chosen, protocol)
+        executed = time.perf_counter()
+        row = int(outcome.object[0])
+        success = bool(outcome.success[0])
+        attempts.append(
+            Attempt(
+                scene=index,
+                number=len(attempts),
+                success=success,
+                reason=Reason(int(outcome.reason[0])).name.lower(),
+                target=None if target is None else here[target].name,
+                lifted=here[row].name if success else None,
+                score=float(chosen.quality[0]),
+                epsilon=None
+                if epsilon is None or target is None
+                else epsilon(here[target], poses[present[target]], chosen),
+                seconds={"render": looked - began, "predict": predicted - looked, "execute": executed - predicted},
+            )
+        )
+        if draw:
+            strips.append(
+                {"names": [item.name for item in here], "poses": poses[present], "grasp": chosen, "view": view}
+            )
+        poses[present] = outcome.final[0].to(poses)
+        if success:
+            removed.append(here[row].name)
+            del present[row]
+            failed = []
+        else:
+            failed.append(chosen)
+            present = [i for i in present if _on_table(poses[i], protocol)]
+    return Episode(index, names, tuple(removed), tuple(attempts), tuple(strips))
+
+
+def choose(offered: Grasps, failed: Sequence[Grasps], policy: Policy) -> Grasps | None:
+    """Return the best offered grasp (world frame) that does not repeat a failed one; the best where all do."""
+    if len(offered) == 0:
+        return None
+    fresh = torch.ones(len(offered), dtype=torch.bool)
+    for grasp in failed:
+        near = torch.linalg.vector_norm(offered.pose[:, :3, 3] - grasp.pose[:, :3, 3], dim=1) < policy.distance
+        alike = rotation_angle(offered.pose[:, :3, :3], grasp.pose[:, :3, :3]) < policy.angle
+        fresh &= ~(near & alike)
+    return offered[int(fresh.nonzero()[0, 0]) if fresh.any() else 0]
+
+
+def ceilings(
+    index: int,
+    objects: Sequence[Object],
+    poses: Float[Tensor, "O 4 4"],
+    labels: Grasps,
+    hand: Hand,
+    simulator: Simulator,
+    protocol: Protocol,
+    seed: int,
+) -> dict[str, list[bool]]:
+    """Execute, for each object of the untouched scene, its best label by epsilon and a random one.
+
+    `labels` are the feasible grasps of the scene (world frame); an object without any is not counted.
+    """
+    chosen: dict[str, list[Grasps]] = {"best_epsilon": [], "random": []}
+    for row in range(len(objects)):
+        own = (labels.object == row).nonzero().flatten()
+        if len(own) == 0:
+            continue
+        chosen["best_epsilon"].append(labels[int(own[labels.quality[own].argmax()])])
+        chosen["random"].append(labels[int(own[int(stream(seed, "ceiling", index, row).integers(len(own)))])])
+    verdicts: dict[str, list[bool]] = {}
+    for kind, grasps in chosen.items():
+        outcomes = simulator.execute(objects, poses, hand, Grasps.cat(grasps), protocol) if grasps else None
+        verdicts[kind] = [] if outcomes is None else [bool(x) for x in outcomes.success]
+    return verdicts
+
+
+def summarise(episodes: Sequence[Episode], seed: int) -> dict[str, Any]:
+    """Return SR, CR and epsilon with 95 % intervals (bootstrap over scenes; Wilson where scenes hold one object)."""
+    wins = [sum(a.success for a in e.attempts) for e in episodes]
+    tries = [len(e.attempts) for e in episodes]
+    removed, present = [len(e.removed) for e in episodes], [len(e.present) for e in episodes]
+    single = all(count == 1 for count in tries)
+    interval = wilson(sum(wins), sum(tries)) if single else bootstrap_ratio(wins, tries, seed)
+    attempts = [attempt for episode in episodes for attempt in episode.attempts]
+    qualities = [[a.epsilon for a in e.attempts if a.epsilon is not None] for e in episodes]
+    return {
+        "scenes": len(episodes),
+        "attempts": sum(tries),
+        "objects": sum(present),
+        "success_rate": {**rate(sum(wins), sum(tries), interval), "interval_kind": "wilson" if single else "bootstrap"},
+        "completion_rate": rate(sum(removed), sum(present), bootstrap_ratio(removed, present, seed)),
+        "epsilon": rate(
+            float(sum(map(sum, qualities))),
+            sum(map(len, qualities)),
+            bootstrap_ratio([float(sum(q)) for q in qualities], [len(q) for q in qualities], seed),
+        ),
+        "reasons": dict(Counter(attempt.reason for attempt in attempts)),
+        "seconds": {
+            stage: float(np.median([a.seconds[stage] for a in attempts if stage in a.seconds] or [math.nan]))
+            for stage in ("render", "predict", "execute")
+        },
+    }
+
+
+def rate(top: float, bottom: int, interval: tuple[float, float]) -> dict[str, Any]:
+    """Return a rate with what it was made of; None where nothing was tried."""
+    return {"value": top / bottom if bottom else None, "low": interval[0], "high": interval[1], "trials": bottom}
+
+
+def attempt_rows(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
+    """Return every attempt as plain values, for results.json."""
+    return [asdict(attempt) for episode in episodes for attempt in episode.attempts]
+
+
+def _nothing(scene: int, number: int, looking: float, predicting: float) -> Attempt:
+    seconds = {"render": looking, "predict": predicting}
+    return Attempt(scene, number, False, Reason.NO_GRASP.name.lower(), None, None, None, None, seconds)
+
+
+def _target(grasp: Grasps, view: View) -> int | None:
+    """Return the object nearest to the grasp's known contact, or None for the table."""
+    contacts = grasp.moved(inverse(view.world_T_camera.to(grasp.pose))).contacts[0]
+    known = contacts[~contacts.isnan().any(dim=1)]
+    if len(known) == 0:
+        return None
+    nearest = torch.cdist(known[:1], view.points.to(known), compute_mode="donot_use_mm_for_euclid_dist").argmin()
+    instance = int(view.instance[nearest])
+    return instance if instance >= 0 else None
+
+
+def _on_table(pose: Float[Tensor, "4 4"], protocol: Protocol) -> bool:
+    return bool(pose.isfinite().all()) and float(pose[2, 3]) > -0.05

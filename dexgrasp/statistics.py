@@ -1,0 +1,37 @@
+"""95 % intervals for success rates."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dexgrasp.seeds import stream
+
+Z = 1.959963984540054
+
+
+def wilson(successes: int, trials: int) -> tuple[float, float]:
+    """Return the Wilson score interval of a rate from independent trials; (0, 1) without any trial."""
+    if trials == 0:
+        return 0.0, 1.0
+    rate = successes / trials
+    centre = rate + Z**2 / (2 * trials)
+    spread = Z * np.sqrt(rate * (1 - rate) / trials + Z**2 / (4 * trials**2))
+    scale = 1 + Z**2 / trials
+    return float(max(0.0, (centre - spread) / scale)), float(min(1.0, (centre + spread) / scale))
+
+
+def bootstrap_ratio(
+    numerators: Sequence[float], denominators: Sequence[float], seed: int = 0, draws: int = 4000
+) -> tuple[float, float]:
+    """Return the percentile interval of sum(numerators) / sum(denominators), resampling whole scenes.
+
+    Attempts within one scene depend on each other, scenes do not.
+    """
+    top, bottom = np.asarray(numerators, float), np.asarray(denominators, float)
+    if len(top) == 0 or bottom.sum() == 0:
+        return 0.0, 1.0
+    rows = stream(seed, "bootstrap").integers(len(top), size=(draws, len(top)))
+    sums = bottom[rows].sum(axis=1)
+    ratios = top[rows].sum(axis=1)[sums > 0] / sums[sums > 0]
+    low, high = np.percentile(ratios, [2.5, 97.5])
+    return float(low), float(high)

@@ -1,0 +1,30 @@
+import numpy as np
+import pytest
+
+from dexgrasp.statistics import bootstrap_ratio, wilson
+
+
+def test_wilson_known_values():
+    # Newcombe (1998), example a: 81 of 263
+    assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
+    assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
+    assert wilson(0, 0) == (0.0, 1.0)
+
+
+def test_bootstrap_covers_and_repeats():
+    generator = np.random.default_rng(0)
+    hits = 0
+    for _ in range(60):
+        trials = generator.integers(3, 8, size=40)
+        successes = generator.binomial(trials, 0.7)
+        low, high = bootstrap_ratio(successes, trials, draws=500)
+        hits += low <= 0.7 <= high
+        assert low <= successes.sum() / trials.sum() <= high
+    assert hits >= 50
+    assert bootstrap_ratio([1, 2], [2, 2]) == bootstrap_ratio([1, 2], [2, 2])
+
+
+def test_bootstrap_resamples_scenes_not_attempts():
+    scenes = bootstrap_ratio([10, 0], [10, 10])
+    attempts = bootstrap_ratio([1] * 10 + [0] * 10, [1] * 20)
+    assert scenes[1] - scenes[0] > attempts[1] - attempts[0]
