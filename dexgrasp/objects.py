@@ -1,0 +1,214 @@
+"""Rigid objects and sets of them: what is grasped."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, overload
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dexgrasp.errors import DexgraspError
+from dexgrasp.seeds import stream
+from dexgrasp.shapes import FAMILIES, HELD_OUT, Family
+from dexgrasp.shapes.solid import Solid
+from dexgrasp.stable import stable_poses
+
+Array = NDArray[np.float64]
+
+SPLITS = ("train", "test", "all")
+FIRST_TEST_NUMBER = 500
+"""Shapes of the test split are numbered from here, so that no draw is in both splits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Object:
+    """A rigid body. Object frame: that of its file, or for procedural shapes z up about the centre of mass; metres."""
+
+    name: str
+    family: str
+    mesh: trimesh.Trimesh
+    """Watertight surface, faces outward, m."""
+    parts: tuple[trimesh.Trimesh, ...]
+    """Convex bodies that together cover the mesh, for physics, m."""
+    source: str = ""
+    """Where it comes from: a path, or how it was drawn."""
+
+    @cached_property
+    def com(self) -> Array:
+        """Centre of mass (3,), m, at uniform density."""
+        return np.array(self.mesh.center_mass)
+
+    @cached_property
+    def volume(self) -> float:
+        """Enclosed volume, m^3."""
+        return float(self.mesh.volume)
+
+    @cached_property
+    def radius(self) -> float:
+        """Largest distance from the centre of mass to the surface, m."""
+        return float(np.linalg.norm(self.mesh.vertices - self.com, axis=1).max())
+
+    @cached_property
+    def stable(self) -> tuple[Array, Array]:
+        """Resting poses world_T_object on z = 0 (K 4 4) and their probabilities (K,), see `stable_poses`."""
+        return stable_poses(np.asarray(self.mesh.vertices), self.com)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Arrays travel, trimesh's caches do not.
+        known = {key: self.__dict__[key] for key in ("com", "volume", "radius", "stable") if key in self.__dict__}
+        bodies = tuple((np.asarray(body.vertices), np.asarray(body.faces)) for body in (self.mesh, *self.parts))
+        return _rebuild, (self.name, self.family, bodies, self.source, known)
+
+
+def _rebuild(
+    name: str, family: str, bodies: Sequence[tuple[Array, NDArray[Any]]], source: str, known: Mapping[str, Any]
+) -> Object:
+    mesh, *parts = (trimesh.Trimesh(vertices, faces, process=False) for vertices, faces in bodies)
+    made = Object(name, family, mesh, tuple(parts), source)
+    made.__dict__.update(known)
+    return made
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectSet(Sequence[Object]):
+    """Objects in a fixed order, found by index or by name."""
+
+    name: str
+    objects: tuple[Object, ...]
+    skipped: tuple[tuple[str, str], ...] = ()
+    """Objects left out: (name, reason)."""
+    _places: dict[str, int] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_places", {item.name: place for place, item in enumerate(self.objects)})
+        if len(self._places) < len(self.objects):
+            raise ValueError(f"{self.name}: object names must differ")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names in order."""
+        return tuple(item.name for item in self.objects)
+
+    def __len__(self) -> int:
+        return len(self.objects)
+
+    def __iter__(self) -> Iterator[Object]:
+        return iter(self.objects)
+
+    @overload
+    def __getitem__(self, key: int | str) -> Object: ...
+    @overload
+    def __getitem__(self, key: slice) -> "ObjectSet": ...
+    def __getitem__(self, key: int | str | slice) -> "Object | ObjectSet":
+        if isinstance(key, slice):
+            return ObjectSet(self.name, self.objects[key], self.skipped)
+        if isinstance(key, str):
+            if key not in self._places:
+                raise DexgraspError(f"an object of the set {self.name!r}", repr(key), f"take one of {self.names[:20]}")
+            return self.objects[self._places[key]]
+        return self.objects[key]
+
+
+def load_objects(config: Mapping[str, Any]) -> ObjectSet:
+    """Return the set that a config of the group `objects` describes.
+
+    ``kind: procedural`` with ``split`` (train, test, all), ``count`` (null: the whole split), ``seed``;
+    ``kind: folder`` with ``path`` and the options of `dexgrasp.meshes.load_folder`.
+    Raises DexgraspError for unknown kinds and keys.
+    """
+    options = {str(key): value for key, value in config.items() if key not in ("kind", "name")}
+    loaders = {"procedural": procedural, "folder": _folder}
+    kind = config.get("kind")
+    if kind not in loaders:
+        raise DexgraspError("objects.kind to be procedural or folder", repr(kind), "set objects.kind")
+    try:
+        return loaders[str(kind)](**options)
+    except TypeError as error:
+        if "argument" not in str(error):
+            raise
+        raise DexgraspError(f"options of objects.kind={kind}", str(error), "see conf/objects/*.yaml") from error
+
+
+def _folder(**options: Any) -> ObjectSet:
+    from dexgrasp.meshes import load_folder
+
+    objects, skipped = load_folder(**options)
+    return ObjectSet(str(options["path"]), tuple(objects), tuple(skipped))
+
+
+def procedural(split: str = "train", count: int | None = None, seed: int = 0) -> ObjectSet:
+    """Return embedded shapes; `count` null gives the split's default number. Same arguments, same shapes.
+
+    A shape follows from the seed, its family and its number alone. The test split holds other draws of every
+    training family, and families that training never sees.
+    """
+    if split not in SPLITS:
+        raise DexgraspError(f"objects.split to be one of {SPLITS}", repr(split), "set objects.split")
+    if split == "all":
+        halves = [procedural(half, count, seed) for half in ("train", "test")]
+        return ObjectSet(f"procedural-all-{seed}", (*halves[0], *halves[1]))
+    families = FAMILIES if split == "train" else HELD_OUT | FAMILIES
+    count = (4 * len(FAMILIES) if split == "train" else len(families) + len(HELD_OUT)) if count is None else count
+    start = 0 if split == "train" else FIRST_TEST_NUMBER
+    names = list(families)
+    drawn = [(names[i % len(names)], start + i // len(names)) for i in range(count)]
+    objects = tuple(shape(family, number, seed) for family, number in drawn)
+    return ObjectSet(f"procedural-{split}-{seed}", objects)
+
+
+def shape(family: str, number: int, seed: int = 0) -> Object:
+    """Return one procedural shape, its centre of mass at the origin; raises DexgraspError for an unknown family."""
+    makers: dict[str, Family] = FAMILIES | HELD_OUT
+    if family not in makers:
+        raise DexgraspError("a shape family", repr(family), f"take one of {sorted(makers)}")
+    solid = makers[family](stream(seed, "object", family, number))
+    return _object(solid, f"{family}_{number:03d}", family, f"procedural seed={seed}")
+
+
+def _object(solid: Solid, name: str, family: str, source: str) -> Object:
+    surface = solid.body.to_mesh64()
+    vertices, faces = np.asarray(surface.vert_properties)[:, :3], np.asarray(surface.tri_verts).astype(np.int64)
+    centre = trimesh.Trimesh(vertices, faces, process=False).center_mass
+    mesh = trimesh.Trimesh(vertices - centre, faces, process=False)
+    parts = tuple(trimesh.convex.convex_hull(part - centre) for part in solid.parts)
+    return Object(name, family, mesh, parts, source)
+
+
+def object_to_tensors(item: Object) -> dict[str, Tensor]:
+    """Return everything of an object as tensors (float64, int64; texts as UTF-8 bytes), for a store."""
+    poses, probabilities = item.stable
+    texts = json.dumps([item.name, item.family, item.source]).encode()
+    part_offsets = np.cumsum([[0, 0], *((len(part.vertices), len(part.faces)) for part in item.parts)], axis=0)
+    arrays = {
+        "vertices": item.mesh.vertices,
+        "faces": item.mesh.faces,
+        "part_vertices": np.vstack([part.vertices for part in item.parts]),
+        "part_faces": np.vstack([part.faces for part in item.parts]),
+        "part_offsets": part_offsets,
+        "com": item.com,
+        "size": np.array([item.volume, item.radius]),
+        "stable_poses": poses,
+        "stable_probabilities": probabilities,
+        "texts": np.frombuffer(texts, dtype=np.uint8),
+    }
+    return {key: torch.from_numpy(np.array(value)) for key, value in arrays.items()}
+
+
+def object_from_tensors(tensors: Mapping[str, Tensor]) -> Object:
+    """Rebuild the object of `object_to_tensors`, bit by bit."""
+    arrays = {key: value.numpy() for key, value in tensors.items()}
+    name, family, source = json.loads(arrays["texts"].tobytes())
+    offsets = arrays["part_offsets"]
+    bodies = [(arrays["vertices"], arrays["faces"])]
+    for (v0, f0), (v1, f1) in zip(offsets[:-1], offsets[1:], strict=True):
+        bodies.append((arrays["part_vertices"][v0:v1], arrays["part_faces"][f0:f1]))
+    volume, radius = map(float, arrays["size"])
+    stable = (arrays["stable_poses"], arrays["stable_probabilities"])
+    return _rebuild(
+        name, family, bodies, source, {"com": arrays["com"], "volume": volume, "radius": radius, "stable": stable}
+    )
