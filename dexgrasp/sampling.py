@@ -1,0 +1,142 @@
+"""Farthest point sampling and neighbours of a cloud, on the CPU, independent of the order of its points.
+
+Each function has a pure-torch reference of the same result, for tests and for other devices.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numba import njit
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+_BUCKET = 64
+"""Points per bucket: below it the tests of the boxes dominate, above it the distances."""
+
+
+def farthest_points(points: Float[Tensor, "N 3"], count: int) -> Int[Tensor, "count"]:
+    """Return `count` indices, each the point farthest from all before it (Eldar et al. 1997), exactly.
+
+    The first is the point farthest from the middle of the bounding box; equal distances are decided by x, then y,
+    then z. More points than there are repeat the first in that order.
+    """
+    xyz = np.ascontiguousarray(points.detach().cpu().numpy(), dtype=np.float32)
+    order = np.argsort(_morton(xyz), kind="stable")
+    return torch.from_numpy(order[_farthest(xyz[order], count)])
+
+
+def farthest_points_reference(points: Float[Tensor, "N 3"], count: int) -> Int[Tensor, "count"]:
+    """Return the same as `farthest_points`, in O(N count) torch on the points' device."""
+    xyz = points.detach().float()
+    rank = torch.from_numpy(np.lexsort(xyz.cpu().numpy().T[::-1])).to(xyz.device)
+    xyz = xyz[rank]  # argmax takes the first of equals
+    chosen = _squared(xyz - (xyz.amin(0) + xyz.amax(0)) / 2).argmax().reshape(1)
+    nearest = torch.full_like(xyz[:, 0], float("inf"))
+    for _ in range(count - 1):
+        nearest = torch.minimum(nearest, _squared(xyz - xyz[chosen[-1]]))
+        chosen = torch.cat([chosen, nearest.argmax().reshape(1)])
+    return rank[chosen]
+
+
+def neighbours(
+    points: Float[Tensor, "N 3"], centres: Float[Tensor, "M 3"], count: int, radius: float = float("inf")
+) -> Int[Tensor, "M count"]:
+    """Return the nearest `count` points within `radius` (m) of each centre, nearest first.
+
+    Where there are fewer, the nearest is repeated (also when it lies outside).
+    """
+    tree = cKDTree(points.detach().cpu().numpy(), balanced_tree=False, compact_nodes=False)
+    query = centres.detach().cpu().numpy()
+    index = tree.query(query, k=range(1, count + 1), distance_upper_bound=radius)[1]
+    lonely = index[:, 0] == tree.n
+    if lonely.any():
+        index[lonely, 0] = tree.query(query[lonely])[1]
+    return torch.from_numpy(np.where(index == tree.n, index[:, :1], index))
+
+
+def neighbours_reference(
+    points: Float[Tensor, "N 3"], centres: Float[Tensor, "M 3"], count: int, radius: float = float("inf")
+) -> Int[Tensor, "M count"]:
+    """Return the same as `neighbours`, in O(N M) torch on the points' device."""
+    table = torch.cdist(centres.double(), points.double(), compute_mode="donot_use_mm_for_euclid_dist")
+    distance, index = table.topk(min(count, len(points)), dim=1, largest=False)
+    index = torch.where(distance < radius, index, index[:, :1])
+    return torch.cat([index, index[:, :1].expand(-1, count - index.shape[1])], dim=1)
+
+
+def _squared(vectors: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+    x, y, z = vectors.unbind(-1)
+    return x * x + y * y + z * z  # the kernel's order of operations, bit by bit
+
+
+def _morton(xyz: np.ndarray) -> np.ndarray:
+    """Return the position of each point along a space-filling curve (Morton 1966), 10 bits an axis."""
+    low = xyz.min(axis=0)
+    extent = max(float((xyz.max(axis=0) - low).max()), 1e-9)
+    cells = ((xyz - low) * np.float32(1023.0 / extent)).astype(np.uint32)
+    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+        cells = (cells | (cells << np.uint32(shift))) & np.uint32(mask)
+    return cells[:, 0] | (cells[:, 1] << np.uint32(1)) | (cells[:, 2] << np.uint32(2))
+
+
+@njit(cache=True)
+def _before(xyz: np.ndarray, a: int, b: int) -> bool:
+    for axis in range(3):
+        if xyz[a, axis] != xyz[b, axis]:
+            return xyz[a, axis] < xyz[b, axis]
+    return False
+
+
+@njit(cache=True)
+def _farthest(xyz: np.ndarray, count: int) -> np.ndarray:
+    """Return farthest points of a spatially sorted cloud; buckets of it that a choice cannot reach are skipped.
+
+    The bound is exact: rounding is monotone, so a computed distance to a box never exceeds that to a point in it.
+    """
+    total = len(xyz)
+    buckets = (total + _BUCKET - 1) // _BUCKET
+    low = np.empty((buckets, 3), np.float32)
+    high = np.empty((buckets, 3), np.float32)
+    nearest = np.full(total, np.inf, np.float32)
+    farthest = np.full(buckets, np.inf, np.float32)
+    best = np.empty(buckets, np.int64)
+    columns = np.empty((3, total), np.float32)
+    for axis in range(3):
+        columns[axis] = xyz[:, axis]
+        for b in range(buckets):
+            part = columns[axis, b * _BUCKET : (b + 1) * _BUCKET]
+            low[b, axis], high[b, axis] = part.min(), part.max()
+    middle = np.empty(3, np.float32)
+    for axis in range(3):
+        middle[axis] = (columns[axis].min() + columns[axis].max()) / np.float32(2)
+    current, reach = 0, np.float32(-1)
+    for i in range(total):
+        dx, dy, dz = xyz[i, 0] - middle[0], xyz[i, 1] - middle[1], xyz[i, 2] - middle[2]
+        d = dx * dx + dy * dy + dz * dz
+        if d > reach or (d == reach and _before(xyz, i, current)):
+            reach, current = d, i
+
+    chosen = np.empty(count, np.int64)
+    zero = np.float32(0)
+    for step in range(count):
+        chosen[step] = current
+        x, y, z = xyz[current, 0], xyz[current, 1], xyz[current, 2]
+        reach, following = np.float32(-1), 0
+        for b in range(buckets):
+            dx = max(low[b, 0] - x, x - high[b, 0], zero)
+            dy = max(low[b, 1] - y, y - high[b, 1], zero)
+            dz = max(low[b, 2] - z, z - high[b, 2], zero)
+            if dx * dx + dy * dy + dz * dz < farthest[b]:
+                start, stop = b * _BUCKET, min((b + 1) * _BUCKET, total)
+                for i in range(start, stop):
+                    ex, ey, ez = columns[0, i] - x, columns[1, i] - y, columns[2, i] - z
+                    nearest[i] = min(nearest[i], ex * ex + ey * ey + ez * ez)
+                most, where = np.float32(-1), start
+                for i in range(start, stop):
+                    if nearest[i] > most or (nearest[i] == most and _before(xyz, i, where)):
+                        most, where = nearest[i], i
+                farthest[b], best[b] = most, where
+            if farthest[b] > reach or (farthest[b] == reach and _before(xyz, best[b], following)):
+                reach, following = farthest[b], best[b]
+        current = following
+    return chosen

@@ -1,0 +1,86 @@
+"""Set abstraction and feature propagation on flattened batches: the rows of all clouds, one below the other."""
+
+import itertools
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+def mlp(widths: Sequence[int]) -> nn.Sequential:
+    """Return linear layers from widths[0] to widths[-1], each with batch norm and ReLU; no bias before a norm."""
+    layers: list[nn.Module] = []
+    for before, after in itertools.pairwise(widths):
+        layers += [nn.Linear(before, after, bias=False), nn.BatchNorm1d(after), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers)
+
+
+class SetAbstraction(nn.Module):
+    """The features of a ball of points become one feature at its centre.
+
+    Grouped, as published: max over the ball of mlp([x - c, f]). The first linear layer is split into W [x, f], once
+    per point, and W_x c, once per centre: the same numbers, neighbours times cheaper.
+    Factorised: the max is taken right behind that first layer, the rest of the MLP runs once per centre, with a
+    residual connection where sizes allow. Not the same function, but the same parameters, and several times faster.
+    """
+
+    def __init__(self, channels: int, widths: Sequence[int], factorised: bool) -> None:
+        super().__init__()
+        self.factorised = factorised
+        self.residual = factorised and len(widths) > 1 and widths[0] == widths[-1]
+        self.position = nn.Linear(3, widths[0], bias=False)
+        self.feature = nn.Linear(channels, widths[0], bias=False)
+        self.norm = nn.BatchNorm1d(widths[0])
+        self.rest = mlp(widths)
+
+    def forward(
+        self,
+        points: Float[Tensor, "N 3"],
+        features: Float[Tensor, "N C"],
+        centres: Float[Tensor, "M 3"],
+        group: Int[Tensor, "M K"],
+    ) -> Float[Tensor, "M D"]:
+        # Positions of a scene differ by millimetres around a metre: half precision would lose them.
+        with torch.autocast(points.device.type, enabled=False):
+            rows = self.feature(features.float()) + self.position(points)
+            origin = self.position(centres)
+            if self.factorised:
+                rows = F.embedding_bag(group, rows, mode="max") - origin
+            else:
+                rows = (rows[group] - origin[:, None]).flatten(0, 1)
+        rows = F.relu(self.norm(rows))
+        if self.factorised:
+            return rows + self.rest(rows) if self.residual else self.rest(rows)
+        return self.rest(rows).unflatten(0, group.shape).amax(dim=1)
+
+
+class FeaturePropagation(nn.Module):
+    """Interpolate coarse features onto finer points (3 nearest, inverse squared distance), join theirs, MLP.
+
+    The first linear layer commutes with the interpolation, so its coarse half runs on the coarse points.
+    """
+
+    def __init__(self, coarse: int, skip: int, widths: Sequence[int]) -> None:
+        super().__init__()
+        self.coarse = nn.Linear(coarse, widths[0], bias=False)
+        self.skip = nn.Linear(skip, widths[0], bias=False) if skip else None
+        self.norm = nn.BatchNorm1d(widths[0])
+        self.rest = mlp(widths)
+
+    def forward(
+        self,
+        coarse_points: Float[Tensor, "M 3"],
+        coarse: Float[Tensor, "M C"],
+        points: Float[Tensor, "N 3"],
+        skip: Float[Tensor, "N D"],
+        nearest: Int[Tensor, "N K"],
+    ) -> Float[Tensor, "N E"]:
+        squared = (coarse_points[nearest] - points[:, None]).square().sum(-1)
+        weights = 1 / (squared + 1e-8)
+        weights = weights / weights.sum(1, keepdim=True)
+        rows = F.embedding_bag(nearest, self.coarse(coarse).float(), mode="sum", per_sample_weights=weights)
+        if self.skip is not None:
+            rows = rows + self.skip(skip)
+        return self.rest(F.relu(self.norm(rows)))
