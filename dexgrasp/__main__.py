@@ -58,23 +58,28 @@ def usage() -> str:
     )
 
 
-def pipeline(command: str, overrides: list[str]) -> int:
-    """Run a Hydra app."""
+def pipeline(command: str, arguments: list[str]) -> int:
+    """Run a Hydra app; `HYDRA_FULL_ERROR=1` shows tracebacks as Hydra has them."""
     import hydra
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from dexgrasp import config
+    from dexgrasp import config, overrides
 
+    full = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises instead of printing and exiting: the wording is ours
     config.register()
-    sys.argv = [f"dexgrasp {command}", *overrides]
+    sys.argv = [f"dexgrasp {command}", *arguments]
     start = hydra.main(version_base="1.3", config_path=str(config.conf_folder()), config_name=command)
     try:
         start(config.Task(command))()
     except (HydraException, OmegaConfBaseException) as error:
-        print(f"dexgrasp {command}: {error}", file=sys.stderr)
-        return 2
+        if full:
+            raise
+        raise overrides.explain(error, command, [word for word in arguments if not word.startswith("-")]) from error
+    finally:
+        if not isinstance(sys.exception(), KeyboardInterrupt):
+            config.compare(command)
     return 0
 
 

@@ -3,14 +3,16 @@
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
+from hydra.experimental.callback import Callback
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from dexgrasp import plugins
+from dexgrasp import launcher, plugins
 from dexgrasp.errors import DexgraspError
 
 
@@ -43,8 +45,9 @@ class PluginSearchPath(SearchPathPlugin):
 
 
 def register() -> None:
-    """Make Hydra know the plugins; call before Hydra starts."""
+    """Make Hydra know the plugins and our launcher; call before Hydra starts."""
     Plugins.instance().register(PluginSearchPath)
+    launcher.register()
 
 
 class Task:
@@ -53,11 +56,29 @@ class Task:
     def __init__(self, command: str) -> None:
         self.command = command
         self.__name__ = command
+        self.__module__ = f"dexgrasp.commands.{command}"  # from which Hydra takes the job's name
 
     def __call__(self, config: DictConfig) -> None:
         main: Callable[[DictConfig], None] = import_module(f"dexgrasp.commands.{self.command}").main
         place_urdf(config)
         main(config)
+
+
+class Multirun(Callback):
+    """Remembers where the runs of a multirun lie, so that they can be compared even if some have failed."""
+
+    folder: Path | None = None
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        Multirun.folder = Path(config.hydra.sweep.dir).absolute()
+
+
+def compare(command: str) -> None:
+    """After a multirun, call the command's `compare(folder)` where it has one."""
+    if Multirun.folder is not None and Multirun.folder.is_dir():
+        hook = getattr(import_module(f"dexgrasp.commands.{command}"), "compare", None)
+        if hook is not None:
+            hook(Multirun.folder)
 
 
 def place_urdf(config: DictConfig) -> None:

@@ -11,3 +11,6 @@ class DexgraspError(Exception):
     def __init__(self, expected: str, found: str, remedy: str) -> None:
         self.expected, self.found, self.remedy = expected, found, remedy
         super().__init__(f"expected {expected}\n  found  {found}\n  to do  {remedy}")
+
+    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
+        return type(self), (self.expected, self.found, self.remedy)  # or it could not come back from a worker
