@@ -52,5 +52,5 @@ class Batch:
 def _to(value: Tensor, *args: Any, **kwargs: Any) -> Tensor:
     if value.is_floating_point():
         return value.to(*args, **kwargs)
-    kept = tuple(arg for arg in args if not isinstance(arg, torch.dtype))
+    kept = tuple(arg.device if isinstance(arg, Tensor) else arg for arg in args if not isinstance(arg, torch.dtype))
     return value.to(*kept, **{key: arg for key, arg in kwargs.items() if key != "dtype"})

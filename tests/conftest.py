@@ -9,6 +9,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import pytest
 import torch
 
+from dexgrasp import geometry
+from dexgrasp.hand import Finger, Hand
+
 torch.set_num_threads(1)
 
 
@@ -19,3 +22,57 @@ def shared() -> Path:
     if not folder.is_dir():
         pytest.skip(f"needs test data that is not here: {folder}")
     return folder
+
+
+@pytest.fixture(scope="session")
+def toy_hand():
+    """A hand with unequal fingers: a spread that fingers 1 and 2 share, a third finger of two joints, a fixed joint."""
+    return ToyHand()
+
+
+class ToyHand(Hand):
+    """Fingers stand at radius 5 cm about z and bend towards it; analytic kinematics."""
+
+    def __init__(self) -> None:
+        self.name = "toy"
+        self.joint_names = ("spread", "finger_1", "finger_2", "finger_3", "knuckle_3", "fixed")
+        self.limits = torch.tensor(
+            [[0, torch.pi], [0, 2.4], [0, 2.4], [-0.3, 1.2], [0, 1.5], [0.1, 0.1]], dtype=torch.float64
+        )
+        self.efforts = torch.ones(6)
+        self.link_names = ("base", "tip_1", "tip_2", "tip_3")
+        self.base_T_palm = torch.eye(4, dtype=torch.float64)
+        self.visuals, self.collisions = {}, {}
+        self.chains = (("spread", "finger_1"), ("spread", "finger_2"), ("finger_3", "knuckle_3"))
+        names = self.joint_names
+        mains = [tuple(n for n in names if n in (*chain, "spread")) for chain in self.chains]
+        self.fingers = tuple(
+            Finger(
+                name=f"finger_{i + 1}",
+                link=f"tip_{i + 1}",
+                tip_radius=0.008 + 0.001 * i,
+                tip_center=torch.tensor([0.045, 0.0, 0.004], dtype=torch.float64),
+                outer_joint=torch.zeros(3, dtype=torch.float64),
+                closing_axis=torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64),
+                chain=chain,
+                main=mains[i],
+                supporting=tuple(n for n in names if n not in mains[i]),
+                closing={chain[-1]: 1.0},
+            )
+            for i, chain in enumerate(self.chains)
+        )
+
+    def link_poses(self, joints):
+        value = dict(zip(self.joint_names, joints.unbind(-1), strict=True))
+        zero = torch.zeros_like(joints[:, 0])
+        eye = torch.eye(3).to(joints).expand(len(joints), 3, 3)
+        poses = {"base": geometry.pose(eye, torch.stack([zero, zero, zero], -1))}
+        yaws = (value["spread"] - torch.pi / 2, -value["spread"] - torch.pi / 2, zero + torch.pi / 2)
+        for i, yaw in enumerate(yaws):
+            turn = geometry.axis_angle(joints.new_tensor([0.0, 0.0, 1.0]).expand(len(joints), 3), yaw)
+            bend = value[self.chains[i][-1]] + (value["finger_3"] if i == 2 else 0)
+            # At zero the link's x points up; bending turns it towards the hand's axis.
+            flex = geometry.axis_angle(joints.new_tensor([0.0, -1.0, 0.0]).expand(len(joints), 3), torch.pi / 2 + bend)
+            offset = (turn @ joints.new_tensor([0.05, 0.0, 0.0])).reshape(-1, 3) + joints.new_tensor([0, 0, 0.07])
+            poses[f"tip_{i + 1}"] = geometry.pose(turn @ flex, offset)
+        return poses

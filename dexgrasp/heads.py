@@ -1,0 +1,172 @@
+"""Heads on point features: small MLPs, and joint angles told as bin + residual (METHOD section 2)."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from dexgrasp.errors import DexgraspError
+from dexgrasp.grasps import Grasps
+from dexgrasp.hand import Hand
+
+CERTAIN = 100.0
+"""Logit of the true class in `as_prediction`: its probability is 1 in float32."""
+
+
+def mlp(channels: int, hidden: Sequence[int], out: int) -> nn.Sequential:
+    """Return linear, batch norm, ReLU per hidden layer and a linear layer on top (no bias under a batch norm)."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(channels, width, bias=False), nn.BatchNorm1d(width), nn.ReLU()]
+        channels = width
+    return nn.Sequential(*layers, nn.Linear(channels, out))
+
+
+class Heads(nn.Module):
+    """Named outputs of one stage. ``separate`` gives each its own MLP (the paper); else they share hidden layers."""
+
+    def __init__(self, channels: int, sizes: Mapping[str, int], hidden: Sequence[int], *, separate: bool) -> None:
+        super().__init__()
+        self.sizes = dict(sizes)
+        outputs = list(self.sizes.values()) if separate else [sum(self.sizes.values())]
+        self.layers = nn.ModuleList(mlp(channels, hidden, out) for out in outputs if out > 0)
+
+    def forward(self, features: Float[Tensor, "N C"]) -> dict[str, Tensor]:
+        """Return (N, size) per name."""
+        nothing = features[:, :0]
+        joined = torch.cat([nothing, *(layer(features) for layer in self.layers)], dim=-1)
+        return dict(zip(self.sizes, joined.split(list(self.sizes.values()), dim=-1), strict=True))
+
+
+class JointBins(nn.Module):
+    """How the independent joints of a hand are told: a bin and a residual in it, in [-1/2, 1/2] of its width.
+
+    Joints of zero range say nothing (no bins); joints whose range is a full turn wrap. All functions take `joint`,
+    the index of the joint that each of S slots means at each of N points, because the meaning of a slot may depend
+    on the finger that touches.
+
+    Args:
+        hand: gives ranges and names.
+        bins: number of bins of a joint.
+        shared: number of bins of a joint that is main for every finger (a spread joint).
+        by_joint: number of bins of single joints by name, in place of both.
+    """
+
+    def __init__(
+        self, hand: Hand, *, bins: int = 7, shared: int = 12, by_joint: Mapping[str, int] | None = None
+    ) -> None:
+        super().__init__()
+        chosen = dict(by_joint or {})
+        unknown = sorted(set(chosen) - set(hand.joint_names))
+        if unknown or min([bins, shared, *chosen.values()]) < 1:
+            raise DexgraspError(
+                f"bin counts of at least 1 for joints of {hand.name}: {', '.join(hand.joint_names)}",
+                f"bins={bins}, shared_bins={shared}, joint_bins={chosen}",
+                "mend these options of the representation",
+            )
+        common = shared_joints(hand)
+        lower, upper = hand.limits.double().unbind(-1)
+        counts = [chosen.get(name, shared if name in common else bins) for name in hand.joint_names]
+        count = torch.where(upper > lower, torch.tensor(counts), 0)
+        self.most = max(1, int(count.max()))
+        # Not persistent: they are the hand's and the options', not learnt.
+        self.register_buffer("lower", lower.clone(), persistent=False)
+        self.register_buffer("width", (upper - lower) / count.clamp(min=1), persistent=False)
+        self.register_buffer("count", count, persistent=False)
+        self.register_buffer("continuous", upper - lower >= 2 * torch.pi - 1e-6, persistent=False)
+        self.lower: Tensor
+        self.width: Tensor
+        self.count: Tensor
+        self.continuous: Tensor
+
+    def split(
+        self, angles: Float[Tensor, "N S"], joint: Int[Tensor, "N S"]
+    ) -> tuple[Int[Tensor, "N S"], Float[Tensor, "N S"]]:
+        """Return bin and residual of joint angles (rad); clamped to the range, or wrapped where it is a full turn."""
+        lower, width, count = self.lower[joint].to(angles), self.width[joint].to(angles), self.count[joint]
+        turn = torch.where(self.continuous[joint], torch.remainder(angles - lower, 2 * torch.pi), angles - lower)
+        steps = turn / torch.where(width > 0, width, 1)
+        index = torch.minimum(steps.floor().long().clamp(min=0), (count - 1).clamp(min=0))
+        return index, (steps - index - 0.5).clamp(-0.5, 0.5)
+
+    def join(
+        self, logits: Float[Tensor, "N S B"], residuals: Float[Tensor, "N S B"], joint: Int[Tensor, "N S"]
+    ) -> Float[Tensor, "N S"]:
+        """Return the angles (rad) of the likeliest bins and their residuals, always within the limits."""
+        lower, width = self.lower[joint].to(residuals), self.width[joint].to(residuals)
+        index = self._masked(logits, joint).argmax(-1)
+        residual = residuals.gather(-1, index.unsqueeze(-1)).squeeze(-1).clamp(-0.5, 0.5)
+        return lower + (index + 0.5 + residual) * width
+
+    def loss(
+        self,
+        logits: Float[Tensor, "N S B"],
+        residuals: Float[Tensor, "N S B"],
+        angles: Float[Tensor, "N S"],
+        joint: Int[Tensor, "N S"],
+        *,
+        huber: float = 1.0,
+    ) -> Float[Tensor, "N S"]:
+        """Return cross-entropy on the bin + Huber on the residual of the true bin (paper equations 9 and 10)."""
+        index, residual = self.split(angles, joint)
+        bins = F.cross_entropy(self._masked(logits, joint).flatten(0, 1), index.flatten(), reduction="none")
+        told = residuals.gather(-1, index.unsqueeze(-1)).squeeze(-1)
+        rest = F.smooth_l1_loss(told, residual.to(told), reduction="none", beta=huber)
+        return (bins.view_as(rest) + rest) * (self.count[joint] > 0)
+
+    def as_prediction(
+        self, angles: Float[Tensor, "N S"], joint: Int[Tensor, "N S"]
+    ) -> tuple[Float[Tensor, "N S B"], Float[Tensor, "N S B"]]:
+        """Return logits and residuals that say exactly `angles`."""
+        index, residual = self.split(angles, joint)
+        logits = CERTAIN * F.one_hot(index, self.most).to(angles)
+        return logits, residual.unsqueeze(-1).expand_as(logits).contiguous()
+
+    def _masked(self, logits: Tensor, joint: Tensor) -> Tensor:
+        """Rule out the bins that a joint with fewer than the most does not have."""
+        absent = torch.arange(self.most, device=joint.device) >= self.count[joint].clamp(min=1).unsqueeze(-1)
+        return logits.masked_fill(absent, torch.finfo(logits.dtype).min)
+
+
+def shared_joints(hand: Hand) -> tuple[str, ...]:
+    """Return the joints that are main for every finger, in the hand's order (a BarrettHand's spread)."""
+    return tuple(name for name in hand.joint_names if all(name in finger.main for finger in hand.fingers))
+
+
+def finger_loss(
+    logits: Float[Tensor, "N K"], classes: Int[Tensor, "N"], *, none_weight: float = 1.0, focal: float = 0.0
+) -> Tensor:
+    """Return the mean cross-entropy over none (class 0) and fingers; 0 for no point.
+
+    `none_weight` weighs the points of class 0 against the graspable ones; ``focal > 0`` turns points that are told
+    well already down by (1 - p)^focal (Lin et al. 2017, focal loss).
+    """
+    log_p = F.log_softmax(logits, dim=-1).gather(-1, classes.unsqueeze(-1)).squeeze(-1)
+    weight = torch.where(classes == 0, none_weight, 1.0).to(log_p)
+    loss = -log_p if focal == 0 else -log_p * (1 - log_p.exp()).clamp(min=1e-6).pow(focal)
+    return (weight * loss).sum() / weight.sum().clamp(min=1e-6)
+
+
+def told_grasps(
+    hand: Hand,
+    points: Float[Tensor, "N 3"],
+    normals: Float[Tensor, "N 3"],
+    finger: Int[Tensor, "N"],
+    pose: Float[Tensor, "N 4 4"],
+    joints: Float[Tensor, "N J"],
+    score: Float[Tensor, "N"],
+) -> Grasps:
+    """Return decoded grasps, whose contact with `finger` is the point; those of the other fingers are NaN."""
+    grasps = Grasps.build(pose, joints, len(hand.fingers), finger=finger, quality=score)
+    touching = F.one_hot(finger, len(hand.fingers)).bool().unsqueeze(-1)
+    return grasps.replace(
+        contacts=torch.where(touching, points.unsqueeze(1), grasps.contacts),
+        normals=torch.where(touching, normals.unsqueeze(1), grasps.normals),
+    )
+
+
+def masked_mean(values: Float[Tensor, "N *r"], mask: Tensor) -> Tensor:
+    """Return the mean over the points of `mask`, summed over the other axes; 0 (with gradient) where it is empty."""
+    return values[mask].sum() / mask.sum().clamp(min=1)

@@ -1,0 +1,171 @@
+"""A grasp told from one fingertip contact: finger projection, main joints, supporting joints."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from dexgrasp.contact_frame import place, project
+from dexgrasp.grasps import Grasps
+from dexgrasp.hand import Hand
+from dexgrasp.heads import CERTAIN, Heads, JointBins, finger_loss, masked_mean, shared_joints, told_grasps
+from dexgrasp.representation import Prediction, Representation, Targets
+
+
+class Contact(Representation):
+    """Parameters: x, y, then joint angles in slots: the touching finger's main joints, then its supporting ones.
+
+    What a slot means depends on the finger (paper: theta_ms, theta_m, theta_s1, theta_s2); each keeps the hand's
+    order. Three stages (paper, figure 3): which finger touches, if any; projection and main joints; supporting
+    joints. Angles in rad.
+
+    The representation is lossy: it assumes that the contact normal lies in the finger's flexion plane.
+
+    Args:
+        hand: any hand.
+        channels: size of a point feature.
+        refine: predict supporting joints from features and the outputs of stages 1 and 2; else from features alone.
+        hidden: widths of the hidden layers of each MLP.
+        separate_heads: an MLP for each output, as in the paper; else the outputs of a stage share hidden layers.
+        bins, shared_bins, joint_bins: see `JointBins`.
+        alpha, beta, gamma: weights of finger identity, finger projection and joints.
+        gamma_m, gamma_ms, gamma_s: weights of the finger's own main joints, of main joints that all fingers share
+            (spread), and of supporting joints.
+        none_weight, focal: see `finger_loss`.
+        huber: residual (in bins) at which the residual's loss turns from quadratic to linear.
+    """
+
+    def __init__(
+        self,
+        hand: Hand,
+        channels: int,
+        *,
+        refine: bool = True,
+        hidden: Sequence[int] = (128,),
+        separate_heads: bool = False,
+        bins: int = 7,
+        shared_bins: int = 12,
+        joint_bins: Mapping[str, int] | None = None,
+        alpha: float = 1.0,
+        beta: float = 5.0,
+        gamma: float = 5.0,
+        gamma_m: float = 1.0,
+        gamma_ms: float = 1.0,
+        gamma_s: float = 1.0,
+        none_weight: float = 1.0,
+        focal: float = 0.0,
+        huber: float = 1.0,
+    ) -> None:
+        super().__init__()
+        self.hand, self.refine = hand, refine
+        self.alpha, self.beta, self.gamma = alpha, beta, gamma
+        self.gammas = {"main": gamma_m, "shared": gamma_ms, "supporting": gamma_s}
+        self.none_weight, self.focal, self.huber = none_weight, focal, huber
+        self.joints = JointBins(hand, bins=bins, shared=shared_bins, by_joint=joint_bins)
+        order = torch.tensor([hand.joint_index(f.main + f.supporting) for f in hand.fingers])
+        self.size = 2 + order.shape[1]
+
+        # A joint slot is told in stage 2 if it is a main joint of any finger; slots that never move have no head.
+        told = (self.joints.count[order] > 0).any(dim=0)
+        mains = max(len(f.main) for f in hand.fingers)
+        self.main_slots = [k for k in range(mains) if told[k]]
+        self.supporting_slots = [k for k in range(mains, order.shape[1]) if told[k]]
+        self.register_buffer("order", order, persistent=False)
+        self.register_buffer("kind", _kinds(hand), persistent=False)
+        self.order: Tensor
+        self.kind: Tensor
+
+        each = 2 * self.joints.most
+        first = {"finger": len(hand.fingers) + 1}
+        second = {"xy": 2, "main": each * len(self.main_slots)}
+        third = {"supporting": each * len(self.supporting_slots)}
+        told_before = sum(first.values()) + sum(second.values()) if refine else 0
+        self.stage_1 = Heads(channels, first, hidden, separate=separate_heads)
+        self.stage_2 = Heads(channels, second, hidden, separate=separate_heads)
+        self.stage_3 = Heads(channels + told_before, third, hidden, separate=separate_heads)
+
+    def encode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grasps: Grasps) -> Targets:
+        """Tell N grasps; `encodable` is False where z <= 0, or where no finger was chosen (then `finger` is 0).
+
+        Lossy where the normal leaves the flexion plane: decode to see what is left of the grasp.
+        """
+        grasps = grasps.to(points)
+        finger = grasps.finger.clamp(min=0)
+        xy, encodable = project(self.hand, finger, points, normals, grasps.pose, grasps.joints)
+        slots = grasps.joints.gather(-1, self.order[finger])
+        return Targets(
+            finger=grasps.finger + 1,
+            parameters=torch.cat([xy, slots], dim=-1),
+            quality=grasps.quality,
+            encodable=encodable & (grasps.finger >= 0),
+        )
+
+    def decode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], prediction: Prediction) -> Grasps:
+        """Return one grasp per point; (x, y) outside the unit disc is projected onto it."""
+        probability = prediction["finger"].softmax(-1)
+        finger = prediction["finger"][:, 1:].argmax(-1)
+        joint = self.order[finger]
+        slots = self.joints.lower[joint].to(points)
+        told = self.main_slots + self.supporting_slots
+        logits, residuals = self._joint_outputs(prediction)
+        slots[:, told] = self.joints.join(logits, residuals, joint[:, told]).to(points)
+        joints = torch.empty_like(slots).scatter(-1, joint, slots)
+        base = place(self.hand, finger, points, normals, prediction["xy"].to(points), joints)
+        return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0])
+
+    def forward(self, features: Float[Tensor, "N C"]) -> Prediction:
+        """Run the three stages: finger (N, F + 1) logits, xy (N, 2), main and supporting (N, slots, 2, bins)."""
+        told = self.stage_1(features)
+        told |= self.stage_2(features)
+        told |= self.stage_3(torch.cat([features, *told.values()], dim=-1) if self.refine else features)
+        for name, slots in (("main", self.main_slots), ("supporting", self.supporting_slots)):
+            told[name] = told[name].unflatten(-1, (len(slots), 2, self.joints.most))
+        return told
+
+    def loss(self, prediction: Prediction, targets: Targets) -> dict[str, Tensor]:
+        """Return METHOD section 2's terms: finger, projection, main, shared, supporting.
+
+        Points that are graspable but not encodable count nowhere; all terms but the first count contact points only.
+        """
+        known = (targets.finger == 0) | targets.encodable
+        contact = (targets.finger > 0) & targets.encodable
+        classes = finger_loss(
+            prediction["finger"][known], targets.finger[known], none_weight=self.none_weight, focal=self.focal
+        )
+        finger = (targets.finger - 1).clamp(min=0)
+        xy = targets.parameters[:, :2].to(prediction["xy"])
+        terms = {
+            "finger": self.alpha * classes,
+            "projection": self.beta * masked_mean((prediction["xy"] - xy).norm(dim=-1), contact),
+        }
+        told = self.main_slots + self.supporting_slots
+        joint, kind = self.order[finger][:, told], self.kind[finger][:, told]
+        logits, residuals = self._joint_outputs(prediction)
+        slots = targets.parameters[:, 2:][:, told]
+        losses = self.joints.loss(logits, residuals, slots, joint, huber=self.huber)
+        for index, (name, weight) in enumerate(self.gammas.items()):
+            terms[name] = self.gamma * weight * masked_mean(losses * (kind == index), contact)
+        return terms
+
+    def as_prediction(self, targets: Targets) -> Prediction:
+        """Return what a perfect network would put out."""
+        finger = (targets.finger - 1).clamp(min=0)
+        classes = CERTAIN * F.one_hot(targets.finger, len(self.hand.fingers) + 1).to(targets.parameters)
+        prediction = {"finger": classes, "xy": targets.parameters[:, :2]}
+        for name, slots in (("main", self.main_slots), ("supporting", self.supporting_slots)):
+            told = self.joints.as_prediction(targets.parameters[:, 2:][:, slots], self.order[finger][:, slots])
+            prediction[name] = torch.stack(told, dim=-2)
+        return prediction
+
+    def _joint_outputs(self, prediction: Prediction) -> tuple[Tensor, Tensor]:
+        outputs = torch.cat([prediction["main"], prediction["supporting"]], dim=1)
+        return outputs[..., 0, :], outputs[..., 1, :]
+
+
+def _kinds(hand: Hand) -> Int[Tensor, "F J"]:
+    """Return what each slot of each finger is: 0 own main joint, 1 main joint shared by all fingers, 2 supporting."""
+    shared = shared_joints(hand)
+    rows = [[1 if n in shared else 0 for n in f.main] + [2] * len(f.supporting) for f in hand.fingers]
+    return torch.tensor(rows)

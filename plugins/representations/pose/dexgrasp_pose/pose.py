@@ -1,0 +1,139 @@
+"""A grasp told outright: where the base is, how it is turned, and every joint."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from dexgrasp import geometry
+from dexgrasp.grasps import Grasps
+from dexgrasp.hand import Hand
+from dexgrasp.heads import CERTAIN, Heads, JointBins, finger_loss, masked_mean, told_grasps
+from dexgrasp.representation import Prediction, Representation, Targets
+
+
+class Pose(Representation):
+    """Parameters: offset from the point to the base (3, in units of `scale`), rotation (6), joints in the hand's order.
+
+    The rotation is told by the first two columns of frame_R_base (Zhou et al. 2019, "On the continuity of rotation
+    representations"), made orthonormal by Gram-Schmidt. Lossless: every grasp can be told from every point. The
+    normal is not used.
+
+    Args:
+        hand: any hand.
+        channels: size of a point feature.
+        scale: unit of the offset, m; about the size of a hand makes outputs of order one.
+        hidden: widths of the hidden layers of each MLP.
+        separate_heads: an MLP for each output; else all but the finger's share hidden layers.
+        bins, shared_bins, joint_bins: see `JointBins`.
+        alpha, beta_offset, beta_rotation, gamma: weights of finger identity, offset, rotation and joints.
+        none_weight, focal: see `finger_loss`.
+        huber: residual (in bins) at which the residual's loss turns from quadratic to linear.
+    """
+
+    def __init__(
+        self,
+        hand: Hand,
+        channels: int,
+        *,
+        scale: float = 0.1,
+        hidden: Sequence[int] = (128,),
+        separate_heads: bool = False,
+        bins: int = 7,
+        shared_bins: int = 12,
+        joint_bins: Mapping[str, int] | None = None,
+        alpha: float = 1.0,
+        beta_offset: float = 5.0,
+        beta_rotation: float = 5.0,
+        gamma: float = 5.0,
+        none_weight: float = 1.0,
+        focal: float = 0.0,
+        huber: float = 1.0,
+    ) -> None:
+        super().__init__()
+        self.hand, self.scale = hand, scale
+        self.alpha, self.beta_offset, self.beta_rotation, self.gamma = alpha, beta_offset, beta_rotation, gamma
+        self.none_weight, self.focal, self.huber = none_weight, focal, huber
+        self.joints = JointBins(hand, bins=bins, shared=shared_bins, by_joint=joint_bins)
+        self.told = torch.nonzero(self.joints.count).flatten().tolist()
+        self.size = 9 + len(hand.joint_names)
+        sizes = {"offset": 3, "rotation": 6, "joints": 2 * self.joints.most * len(self.told)}
+        self.stage_1 = Heads(channels, {"finger": len(hand.fingers) + 1}, hidden, separate=separate_heads)
+        self.stage_2 = Heads(channels, sizes, hidden, separate=separate_heads)
+
+    def encode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grasps: Grasps) -> Targets:
+        """Tell N grasps; `encodable` is False only where no finger was chosen (then `finger` is 0)."""
+        grasps = grasps.to(points)
+        offset = (grasps.pose[:, :3, 3] - points) / self.scale
+        columns = grasps.pose[:, :3, :2].transpose(-1, -2).flatten(1)
+        return Targets(
+            finger=grasps.finger + 1,
+            parameters=torch.cat([offset, columns, grasps.joints], dim=-1),
+            quality=grasps.quality,
+            encodable=grasps.finger >= 0,
+        )
+
+    def decode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], prediction: Prediction) -> Grasps:
+        """Return one grasp per point."""
+        probability = prediction["finger"].softmax(-1)
+        finger = prediction["finger"][:, 1:].argmax(-1)
+        joint = torch.arange(len(self.hand.joint_names), device=points.device).expand(len(points), -1)
+        joints = self.joints.lower.to(points).repeat(len(points), 1)
+        logits, residuals = prediction["joints"].unbind(-2)
+        joints[:, self.told] = self.joints.join(logits, residuals, joint[:, self.told]).to(points)
+        rotation = _orthonormal(prediction["rotation"].to(points))
+        base = geometry.pose(rotation, points + self.scale * prediction["offset"].to(points))
+        return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0])
+
+    def forward(self, features: Float[Tensor, "N C"]) -> Prediction:
+        """Return finger (N, F + 1) logits, offset (N, 3), rotation (N, 6), joints (N, slots, 2, bins)."""
+        told = self.stage_1(features) | self.stage_2(features)
+        told["joints"] = told["joints"].unflatten(-1, (len(self.told), 2, self.joints.most))
+        return told
+
+    def loss(self, prediction: Prediction, targets: Targets) -> dict[str, Tensor]:
+        """Return the terms finger, offset, rotation and joints; all but the first count contact points only."""
+        known = (targets.finger == 0) | targets.encodable
+        contact = (targets.finger > 0) & targets.encodable
+        classes = finger_loss(
+            prediction["finger"][known], targets.finger[known], none_weight=self.none_weight, focal=self.focal
+        )
+        truth = targets.parameters.to(prediction["offset"])
+        joint = torch.arange(len(self.hand.joint_names), device=truth.device)[self.told].expand(len(truth), -1)
+        logits, residuals = prediction["joints"].unbind(-2)
+        angles = targets.parameters[:, 9:][:, self.told]
+        joints = self.joints.loss(logits, residuals, angles, joint, huber=self.huber)
+        offset = (prediction["offset"] - truth[:, :3]).norm(dim=-1)
+        rotation = (prediction["rotation"] - truth[:, 3:9]).norm(dim=-1)
+        return {
+            "finger": self.alpha * classes,
+            "offset": self.beta_offset * masked_mean(offset, contact),
+            "rotation": self.beta_rotation * masked_mean(rotation, contact),
+            "joints": self.gamma * masked_mean(joints, contact),
+        }
+
+    def as_prediction(self, targets: Targets) -> Prediction:
+        """Return what a perfect network would put out."""
+        joint = torch.arange(len(self.hand.joint_names), device=targets.finger.device)
+        joint = joint[self.told].expand(len(targets), -1)
+        angles = targets.parameters[:, 9:][:, self.told]
+        return {
+            "finger": CERTAIN * F.one_hot(targets.finger, len(self.hand.fingers) + 1).to(targets.parameters),
+            "offset": targets.parameters[:, :3],
+            "rotation": targets.parameters[:, 3:9],
+            "joints": torch.stack(self.joints.as_prediction(angles, joint), dim=-2),
+        }
+
+
+def _orthonormal(columns: Float[Tensor, "N 6"]) -> Float[Tensor, "N 3 3"]:
+    """Return right-handed rotations by Gram-Schmidt; parallel or zero columns fall back on the axes."""
+    eye = torch.eye(3).to(columns)
+    x = F.normalize(torch.where(columns[:, :3].norm(dim=-1, keepdim=True) < 1e-6, eye[0], columns[:, :3]), dim=-1)
+    y = columns[:, 3:] - (columns[:, 3:] * x).sum(-1, keepdim=True) * x
+    # The axis least along x is never parallel to it.
+    spare = eye[x.abs().argmin(-1)]
+    spare = spare - (spare * x).sum(-1, keepdim=True) * x
+    y = F.normalize(torch.where(y.norm(dim=-1, keepdim=True) < 1e-6, spare, y), dim=-1)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
