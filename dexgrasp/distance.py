@@ -1,0 +1,185 @@
+"""Signed distance to an object's surface: a grid for lower bounds, a triangle tree for exact values."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import trimesh
+from numba import njit
+
+from dexgrasp.errors import DexgraspError
+from dexgrasp.quality import Array
+from dexgrasp.triangle_tree import TriangleTree, nearest, triangle_tree
+
+STRIDE = 4
+"""Grid nodes per coarse node: away from the surface, fine nodes are bounded from coarse ones."""
+BAND = 2.0
+"""Nodes that may be nearer to the surface than this many spacings hold the exact distance."""
+PADDING = 4
+"""Spacings by which the grid reaches beyond the object."""
+ROUNDING = 1e-7
+"""Taken off what is stored in single precision, m."""
+
+
+class Field(NamedTuple):
+    """A distance field as arrays that compiled code reads (m)."""
+
+    tree: TriangleTree
+    origin: np.ndarray
+    """(3,) position of node (0, 0, 0)."""
+    spacing: float
+    values: np.ndarray
+    """(X, Y, Z) float32, at most the signed distance; exact to `ROUNDING` near the surface."""
+    seeds: np.ndarray
+    """(X, Y, Z) int32, a triangle that is nearest, or near."""
+
+
+class DistanceField:
+    """Distance to a watertight mesh in its own frame; negative inside, m."""
+
+    def __init__(self, field: Field) -> None:
+        self.field = field
+
+    @classmethod
+    def build(cls, mesh: trimesh.Trimesh, spacing: float = 0.002) -> "DistanceField":
+        """Return the field of a watertight mesh (m); raises DexgraspError where inside and outside are undefined."""
+        if not len(mesh.faces) or not mesh.is_watertight:
+            raise DexgraspError(
+                "a watertight mesh", f"{len(mesh.faces)} faces with open edges", "repair the mesh or leave it out"
+            )
+        tree = triangle_tree(mesh)
+        low, high = tree.boxes[0, :3], tree.boxes[0, 3:]
+        cells = np.ceil((high - low) / spacing / STRIDE).astype(int) * STRIDE + 2 * PADDING
+        origin = (low + high) / 2 - cells * spacing / 2
+        values, seeds = _fill(tree, origin, spacing, cells[0] + 1, cells[1] + 1, cells[2] + 1)
+        return cls(Field(tree, origin, spacing, values, seeds))
+
+    def distance(self, points: Array) -> Array:
+        """Return the signed distance of points (P, 3): exact in the grid, at most the true one outside it (m)."""
+        return self._evaluate(points, _distances)
+
+    def lower_bound(self, points: Array) -> Array:
+        """Return what the grid alone says: at most the signed distance of points (P, 3), less by up to 2 mm (m)."""
+        return self._evaluate(points, _bounds)
+
+    def nearest(self, points: Array) -> tuple[Array, Array, Array]:
+        """Return signed distances (P,), nearest surface points (P, 3) and outward unit normals (P, 3), exact.
+
+        The normal is the direction in which distance grows: that of the face, or between those that meet there.
+        """
+        found = self._evaluate(points, _nearest)
+        return found[:, 0], found[:, 1:4], found[:, 4:7]
+
+    def _evaluate(self, points: Array, kernel) -> Array:  # type: ignore[no-untyped-def]
+        if isinstance(points, np.ndarray):
+            return kernel(self.field, np.ascontiguousarray(points, dtype=np.float64))
+        found = kernel(self.field, np.ascontiguousarray(points.detach().cpu().numpy(), dtype=np.float64))
+        return torch.from_numpy(found).to(points)
+
+
+@njit(cache=True)
+def _fill(
+    tree: TriangleTree, origin: np.ndarray, spacing: float, nx: int, ny: int, nz: int
+) -> tuple[np.ndarray, np.ndarray]:
+    values = np.empty((nx, ny, nz), np.float32)
+    seeds = np.empty((nx, ny, nz), np.int32)
+    out = np.empty(7)
+    seed = 0
+    mx, my, mz = (nx - 1) // STRIDE + 1, (ny - 1) // STRIDE + 1, (nz - 1) // STRIDE + 1
+    coarse = np.empty((mx, my, mz))
+    for i in range(mx):
+        for j in range(my):
+            for k in range(mz):
+                step = STRIDE * spacing
+                seed = nearest(tree, origin[0] + i * step, origin[1] + j * step, origin[2] + k * step, seed, out)
+                coarse[i, j, k] = out[0]
+                seeds[i * STRIDE, j * STRIDE, k * STRIDE] = seed
+    band = BAND * spacing
+    for i in range(nx):
+        for j in range(ny):
+            for k in range(nz):
+                lower, upper = -np.inf, np.inf
+                seed = 0
+                for a in range(2):
+                    for b in range(2):
+                        for c in range(2):
+                            u, v, w = (i // STRIDE) + a, (j // STRIDE) + b, (k // STRIDE) + c
+                            if u >= mx or v >= my or w >= mz:
+                                continue
+                            away = spacing * math.sqrt(
+                                (i - u * STRIDE) ** 2 + (j - v * STRIDE) ** 2 + (k - w * STRIDE) ** 2
+                            )
+                            value = coarse[u, v, w]
+                            lower = max(lower, value - away)
+                            if abs(value) + away < upper:
+                                upper = abs(value) + away
+                                seed = seeds[u * STRIDE, v * STRIDE, w * STRIDE]
+                if lower < band and -lower < 4 * STRIDE * spacing:
+                    x, y, z = origin[0] + i * spacing, origin[1] + j * spacing, origin[2] + k * spacing
+                    seed = nearest(tree, x, y, z, seed, out)
+                    lower = out[0]
+                values[i, j, k] = lower - ROUNDING
+                seeds[i, j, k] = seed
+    return values, seeds
+
+
+@njit(cache=True)
+def lower_bound(field: Field, x: float, y: float, z: float) -> float:
+    """Return a lower bound of the signed distance at a point (m), from one grid node."""
+    h = field.spacing
+    u, v, w = (x - field.origin[0]) / h, (y - field.origin[1]) / h, (z - field.origin[2]) / h
+    nx, ny, nz = field.values.shape
+    if u < 0 or v < 0 or w < 0 or u > nx - 1 or v > ny - 1 or w > nz - 1:
+        box = field.tree.boxes[0]
+        dx = max(box[0] - x, x - box[3], 0.0)
+        dy = max(box[1] - y, y - box[4], 0.0)
+        dz = max(box[2] - z, z - box[5], 0.0)
+        return math.sqrt(dx * dx + dy * dy + dz * dz)
+    i, j, k = int(u + 0.5), int(v + 0.5), int(w + 0.5)
+    away = h * math.sqrt((u - i) ** 2 + (v - j) ** 2 + (w - k) ** 2)
+    return field.values[i, j, k] - away
+
+
+@njit(cache=True)
+def seed_at(field: Field, x: float, y: float, z: float) -> int:
+    """Return a triangle near a point."""
+    h = field.spacing
+    nx, ny, nz = field.values.shape
+    i = min(max(int((x - field.origin[0]) / h + 0.5), 0), nx - 1)
+    j = min(max(int((y - field.origin[1]) / h + 0.5), 0), ny - 1)
+    k = min(max(int((z - field.origin[2]) / h + 0.5), 0), nz - 1)
+    return field.seeds[i, j, k]
+
+
+@njit(cache=True)
+def _nearest(field: Field, points: np.ndarray) -> np.ndarray:
+    found = np.empty((len(points), 7))
+    for i in range(len(points)):
+        x, y, z = points[i]
+        nearest(field.tree, x, y, z, seed_at(field, x, y, z), found[i])
+    return found
+
+
+@njit(cache=True)
+def _bounds(field: Field, points: np.ndarray) -> np.ndarray:
+    found = np.empty(len(points))
+    for i in range(len(points)):
+        found[i] = lower_bound(field, points[i, 0], points[i, 1], points[i, 2])
+    return found
+
+
+@njit(cache=True)
+def _distances(field: Field, points: np.ndarray) -> np.ndarray:
+    found = np.empty(len(points))
+    out = np.empty(7)
+    nx, ny, nz = field.values.shape
+    for i in range(len(points)):
+        x, y, z = points[i]
+        u = (points[i] - field.origin) / field.spacing
+        if u.min() < 0 or u[0] > nx - 1 or u[1] > ny - 1 or u[2] > nz - 1:
+            found[i] = lower_bound(field, x, y, z)
+        else:
+            nearest(field.tree, x, y, z, seed_at(field, x, y, z), out)
+            found[i] = out[0]
+    return found
