@@ -1,0 +1,73 @@
+"""From a user's points to a network's cloud: checked, with normals, thinned."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dexgrasp.errors import DexgraspError
+from dexgrasp.seeds import stream
+
+FEWEST = 32
+FARTHEST = 20.0
+"""Median distance from the camera (m) beyond which a cloud is taken to be in millimetres."""
+DENSE = 4
+"""Normals of very dense clouds are estimated on this many times the network's points."""
+
+Array = Float[np.ndarray, "P 3"] | Float[Tensor, "P 3"]
+
+
+def prepare(points: Array, normals: Array | None, count: int, seed: int) -> Float[Tensor, "N 6"]:
+    """Return positions (m) and unit normals towards the camera of at most `count` points, float32, on the CPU.
+
+    Points are in the camera frame. Larger clouds are thinned at random, the same for the same seed. Raises
+    `DexgraspError` for anything that is not a cloud in metres.
+    """
+    xyz = _checked("points", points)
+    if len(xyz) < FEWEST:
+        raise DexgraspError(f"at least {FEWEST} points", f"{len(xyz)}", "give the cloud of a whole view")
+    distance = float(torch.linalg.vector_norm(xyz, dim=1).median())
+    if distance > FARTHEST:
+        raise DexgraspError(
+            "points in metres in the camera frame",
+            f"a median distance of {distance:.4g} from the camera, which looks like millimetres",
+            "divide the points by 1000",
+        )
+    if normals is None:
+        from dexgrasp.dataset.normals import estimate_normals
+
+        xyz = xyz[_thin(len(xyz), DENSE * count, seed)]
+        directions = estimate_normals(xyz)
+    else:
+        directions = _checked("normals", normals)
+        if directions.shape != xyz.shape:
+            raise DexgraspError(f"one normal per point, {tuple(xyz.shape)}", f"{tuple(directions.shape)}", "match them")
+        length = torch.linalg.vector_norm(directions, dim=1, keepdim=True)
+        if (length == 0).any():
+            raise DexgraspError("normals of non-zero length", f"{int((length == 0).sum())} zeros", "leave normals out")
+        directions = directions / length
+        towards = -(directions * xyz).sum(1, keepdim=True)
+        directions = torch.where(towards < 0, -directions, directions)
+    cloud = torch.cat([xyz, directions], dim=1).float()
+    return cloud[_thin(len(cloud), count, seed)]
+
+
+def _thin(total: int, count: int, seed: int) -> Tensor:
+    if total <= count:
+        return torch.arange(total)
+    return torch.from_numpy(np.sort(stream(seed, "thin", total).permutation(total)[:count]))
+
+
+def _checked(name: str, values: Array) -> Float[Tensor, "P 3"]:
+    rows = torch.as_tensor(values).detach().cpu()
+    if rows.dim() != 2 or rows.shape[1] != 3 or rows.is_complex() or rows.dtype == torch.bool:
+        raise DexgraspError(f"{name} as an array of shape (P, 3)", f"{rows.dtype} {tuple(rows.shape)}", "reshape it")
+    rows = rows.double()
+    broken = int((~rows.isfinite()).any(dim=1).sum())
+    if broken:
+        raise DexgraspError(
+            f"finite {name}",
+            f"{broken} of {len(rows)} rows with NaN or infinity",
+            f"drop pixels without depth first: {name}[numpy.isfinite(points).all(axis=1)]",
+        )
+    return rows

@@ -1,0 +1,122 @@
+"""Which of a network's grasps are offered: free of what the camera saw, clear of the table, and different."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dexgrasp.execution import pregrasp
+from dexgrasp.geometry import rotation_angle
+from dexgrasp.grasps import Grasps
+from dexgrasp.hand import Hand
+from dexgrasp.table import find_table
+
+
+@dataclass(frozen=True)
+class Selection:
+    """`conf/selection`. Lengths in metres, angles in radians."""
+
+    min_score: float = 0.0
+    """Grasps that score less are never offered."""
+    candidates: int = 1024
+    """Only so many of the best are looked at."""
+    depth: float | None = 0.004
+    """How deep an observed point may lie in the open hand; None: the cloud is not looked at."""
+    table: float | None = 0.002
+    """How far the hand may reach below the table that is found in the cloud; None: no table is looked for."""
+    retreat: float = 0.10
+    """Length of the straight approach that must be free."""
+    opening: float = 0.35
+    """How much the closing joints are opened for the approach (rad, or m where prismatic)."""
+    steps: int = 3
+    """Places along the approach that are checked, the grasp's own included."""
+    distance: float = 0.02
+    """Of two grasps nearer than this and than `angle`, the worse is dropped."""
+    angle: float = 0.35
+
+
+def select(
+    hand: Hand, grasps: Grasps, cloud: Float[Tensor, "N 6"], top_k: int, selection: Selection, seed: int = 0
+) -> Grasps:
+    """Return at most `top_k` grasps (of `cloud`'s frame, camera at its origin), best first.
+
+    Candidates are taken in the order of their score and checked lazily, so that good ones cost little.
+    """
+    finite = grasps.pose.flatten(1).isfinite().all(1) & grasps.joints.isfinite().all(1)
+    grasps = grasps[finite & (grasps.quality >= selection.min_score)]
+    order = torch.argsort(grasps.quality, descending=True, stable=True)[: selection.candidates]
+    grasps = grasps[order]
+    shape = _shape(hand) if selection.depth is not None or selection.table is not None else None
+    table = find_table(cloud, seed) if selection.table is not None else None
+    kept: list[int] = []
+    for start, stop in _chunks(len(grasps), top_k):
+        if len(kept) >= top_k:
+            break
+        fresh = [row for row in range(start, stop) if not _alike(grasps, row, kept, selection)]
+        if shape is not None and fresh:
+            passed = free(hand, shape, grasps[fresh], cloud[:, :3], table, selection)
+            fresh = [row for row, good in zip(fresh, passed.tolist(), strict=True) if good]
+        for row in fresh:
+            if len(kept) < top_k and not _alike(grasps, row, kept, selection):
+                kept.append(row)
+    return grasps[kept]
+
+
+def free(
+    hand: Hand,
+    shape: Any,
+    grasps: Grasps,
+    points: Float[Tensor, "P 3"],
+    table: Float[Tensor, "4 4"] | None,
+    selection: Selection,
+) -> Bool[Tensor, "N"]:
+    """Return whether each grasp and its straight approach are free of observed points and of the table.
+
+    The fingers are open by `selection.opening`: they close until they touch, so where they end is no collision; but
+    the table must be clear of the closed posture too. `shape` is the hand's `HandShape`, `table` is table_T_camera.
+    """
+    passed = torch.ones(len(grasps), dtype=torch.bool)
+    if table is not None and selection.table is not None:
+        motion = table.to(grasps.pose)
+        passed &= torch.as_tensor(shape.table_distance(motion @ grasps.pose, grasps.joints)) >= -selection.table
+    for step in range(selection.steps):
+        retreat = selection.retreat * step / max(1, selection.steps - 1)
+        alive = passed.nonzero().flatten()
+        if len(alive) == 0:
+            break
+        pose, joints = pregrasp(hand, grasps[alive], retreat, selection.opening)
+        good = torch.ones(len(alive), dtype=torch.bool)
+        if table is not None and selection.table is not None:
+            good &= torch.as_tensor(shape.table_distance(motion @ pose, joints)) >= -selection.table
+        if selection.depth is not None and good.any():
+            rows = good.nonzero().flatten()
+            good[rows] = torch.as_tensor(shape.cloud_depth(points, pose[rows], joints[rows])) <= selection.depth
+        passed[alive] = good
+    return passed
+
+
+def _chunks(total: int, top_k: int) -> Iterator[tuple[int, int]]:
+    """Ranges over the candidates: as many as are wanted first, then ever more."""
+    start, size = 0, max(16, top_k)
+    while start < total:
+        yield start, min(start + size, total)
+        start, size = start + size, min(2 * size, 256)
+
+
+def _alike(grasps: Grasps, row: int, kept: list[int], selection: Selection) -> bool:
+    if not kept:
+        return False
+    near = torch.linalg.vector_norm(grasps.pose[kept, :3, 3] - grasps.pose[row, :3, 3], dim=1) < selection.distance
+    turned = rotation_angle(grasps.pose[kept, :3, :3], grasps.pose[row, :3, :3]) < selection.angle
+    return bool((near & turned).any())
+
+
+@lru_cache(maxsize=4)
+def _shape(hand: Hand) -> Any:
+    from dexgrasp.collision import HandShape
+
+    return HandShape(hand)
