@@ -153,7 +153,7 @@ def procedural(split: str = "train", count: int | None = None, seed: int = 0) ->
         halves = [procedural(half, count, seed) for half in ("train", "test")]
         return ObjectSet(f"procedural-all-{seed}", (*halves[0], *halves[1]))
     families = FAMILIES if split == "train" else HELD_OUT | FAMILIES
-    count = (4 * len(FAMILIES) if split == "train" else len(families) + len(HELD_OUT)) if count is None else count
+    count = (3 * len(FAMILIES) if split == "train" else len(families)) if count is None else count
     start = 0 if split == "train" else FIRST_TEST_NUMBER
     names = list(families)
     drawn = [(names[i % len(names)], start + i // len(names)) for i in range(count)]
