@@ -38,6 +38,8 @@ class Representation(nn.Module, ABC):
     hand: Hand
     size: int
     """Number P of parameters."""
+    resolution: tuple[float, float] = (1e-5, 1e-4)
+    """How far decode(encode) may move a grasp that can be told: m, rad."""
 
     @abstractmethod
     def encode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grasps: Grasps) -> Targets:
