@@ -1,7 +1,14 @@
 """Every installed plugin obeys the laws that dexgrasp ships, and the laws can fail."""
 
+import copy
+import dataclasses
+
+import pytest
+import torch
+
 from dexgrasp import plugins
-from dexgrasp.testing import conforms
+from dexgrasp.backbone import Backbone
+from dexgrasp.testing import conforms, laws, violations
 
 for name in plugins.names("hand"):
 
@@ -130,7 +137,7 @@ def test_a_bent_representation_breaks_its_laws(hand):
         law("repr", "truth_has_the_least_loss")(Bent(model, loss=inverted))
 
 
-class Forgetful(plugins._base("backbone")):
+class Forgetful(Backbone):
     """Breaks every law of a backbone."""
 
     channels = 8
