@@ -1,0 +1,122 @@
+"""Whether a grasp that a representation gives back still is one (METHOD section 1: labels are truthful)."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dexgrasp.distance import DistanceField
+from dexgrasp.execution import pregrasp
+from dexgrasp.geometry import inverse, rotation_angle
+from dexgrasp.grasps import Grasps
+from dexgrasp.quality import epsilon, wrenches
+
+if TYPE_CHECKING:
+    from dexgrasp.closing import Closer
+
+Clear = Callable[[Grasps], Bool[Tensor, "N"]]
+"""Grasps in the frame of `Truth` -> which are clear of table and neighbours."""
+
+
+@dataclass(frozen=True)
+class TruthSettings:
+    """What must hold of a grasp that is told."""
+
+    distance: float = 0.03
+    """Farthest that the base may have moved from the original, m; farther is not tried."""
+    angle: float = math.radians(25)
+    """Farthest that it may have turned, rad."""
+    close: bool = True
+    """Close the fingers again and test what they touch; else distance and angle decide alone."""
+    same_distance: float = 1e-4
+    """A base that moved and turned by less is the original, whose checks are known to pass, m."""
+    same_angle: float = math.radians(0.1)
+    opening: float = 0.35
+    """By how much joints are opened before they close again, rad; that of execution."""
+    penetration: float = 0.001
+    """Deepest that the closed hand may reach into the object, m."""
+    epsilon: float = 0.05
+    """Least quality of the closed grasp; that of synthesis, as are the next two."""
+    friction: float = 0.5
+    edges: int = 8
+
+
+@dataclass(frozen=True)
+class Body:
+    """An object as the closing hand meets it."""
+
+    field: DistanceField
+    com: np.ndarray = field(repr=False)
+    """Centre of mass in object coordinates, m."""
+    radius: float
+    """Torque scale: largest distance from it to the surface, m."""
+
+
+def deviation(told: Grasps, original: Grasps) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+    """Return how far (m) and by what angle (rad) the bases of told grasps differ from the originals'."""
+    distance = torch.linalg.vector_norm(told.pose[:, :3, 3] - original.pose[:, :3, 3], dim=-1)
+    return distance, rotation_angle(told.pose[:, :3, :3], original.pose[:, :3, :3])
+
+
+class Truth:
+    """The checks that grasps of a scene have passed, for grasps that a representation gives back.
+
+    Args:
+        closer: closes the hand.
+        bodies: the scene's objects; `Grasps.object` counts in them.
+        frame_T_object: where they are in the grasps' frame, m.
+        settings: how far a grasp may move, and the thresholds of synthesis.
+        clear: the scene's own checks, tried last; none where None.
+    """
+
+    def __init__(
+        self,
+        closer: "Closer",
+        bodies: Sequence[Body],
+        frame_T_object: Float[Tensor, "O 4 4"],
+        settings: TruthSettings | None = None,
+        clear: Clear | None = None,
+    ) -> None:
+        self.closer, self.bodies, self.clear = closer, bodies, clear
+        self.object_T_frame = inverse(frame_T_object.double())
+        self.settings = settings or TruthSettings()
+
+    def holds(self, told: Grasps, original: Grasps) -> tuple[Bool[Tensor, "N"], Float[Tensor, "N"]]:
+        """Return which told grasps still pass, and their quality (the original's where not closed anew; else 0).
+
+        Objects are the originals'.
+        """
+        limits = self.settings
+        distance, angle = deviation(told, original)
+        good = (distance <= limits.distance) & (angle <= limits.angle)
+        quality = torch.where(good, original.quality, 0.0)
+        if not limits.close:
+            return good, quality
+        same = (distance <= limits.same_distance) & (angle <= limits.same_angle)
+        again = good & ~same
+        for body in original.object[again].unique().tolist():
+            rows = (again & (original.object == body)).nonzero().flatten()
+            quality[rows] = self._closed_quality(told[rows], body).to(quality)
+            good[rows] = quality[rows] >= limits.epsilon
+        rows = (again & good).nonzero().flatten()
+        if self.clear is not None and len(rows):
+            good[rows] = self.clear(told[rows].replace(object=original.object[rows]))
+        return good, torch.where(good, quality, 0.0)
+
+    def _closed_quality(self, grasps: Grasps, index: int) -> Float[Tensor, "N"]:
+        """Return epsilon of grasps of one object after closing again; 0 where a check fails."""
+        limits, body = self.settings, self.bodies[index]
+        _, opened = pregrasp(self.closer.hand, grasps, opening=limits.opening)
+        closure = self.closer.close(body.field, self.object_T_frame[index] @ grasps.pose.double(), opened.double())
+        good = (closure.touched & closure.on_tip).all(dim=1) & (closure.penetration <= limits.penetration)
+        quality = grasps.quality.new_zeros(len(grasps))
+        if good.any():
+            contacts, normals = closure.contacts[good].double(), closure.normals[good].double()
+            cones = wrenches(contacts, normals, body.com, body.radius, limits.friction, limits.edges)
+            quality[good] = epsilon(cones, threshold=limits.epsilon).to(quality)
+        return quality
