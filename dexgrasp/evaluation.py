@@ -61,8 +61,9 @@ class Episode:
 
 @dataclass(frozen=True)
 class Policy:
-    """Which of the predicted grasps is executed."""
+    """How many attempts there are, and which of the predicted grasps is executed."""
 
+    attempts_per_object: float = 1.5
     distance: float = 0.02
     """A grasp within this distance (m) and angle of one that failed in this scene is passed over once."""
     angle: float = 0.35
@@ -83,61 +84,60 @@ def clear(
     epsilon: Epsilon | None = None,
     draw: bool = False,
 ) -> Episode:
-    """Clear one scene, at most ``protocol.attempts_per_object`` attempts per object.
+    """Clear one scene, at most ``policy.attempts_per_object`` attempts per object.
 
-    Objects that leave the table count as present and are never removed. Poses are world_T_object.
+    Objects that leave the table count as present and are never removed. Poses are world_T_object; the pose of an
+    object that is gone is NaN. After a failure the scene settles before the camera looks again.
     """
     names = tuple(item.name for item in objects)
-    present, poses = list(range(len(objects))), poses.clone()
+    poses = poses.clone()
     removed: list[str] = []
     attempts: list[Attempt] = []
     strips: list[dict[str, Any]] = []
     failed: list[Grasps] = []
-    budget = math.floor(protocol.attempts_per_object * len(objects))
-    while len(attempts) < budget and len(present) > protocol.leave:
+    budget = math.floor(policy.attempts_per_object * len(objects))
+    while len(attempts) < budget and len(standing := present(poses)) > protocol.verdict.stop_at:
         began = time.perf_counter()
-        here = [objects[i] for i in present]
-        view = look(here, poses[present], int(stream(seed, "look", index, len(attempts)).integers(2**31)))
+        view = look([objects[i] for i in standing], poses[standing], _seed(seed, "look", index, len(attempts)))
         looked = time.perf_counter()
-        offered = predict(view)
+        chosen = choose(predict(view).moved(view.world_T_camera), failed, policy)
         predicted = time.perf_counter()
-        chosen = choose(offered.moved(view.world_T_camera), failed, policy)
+        seconds = {"render": looked - began, "predict": predicted - looked}
         if chosen is None:
-            attempts.append(_nothing(index, len(attempts), looked - began, predicted - looked))
+            attempts.append(Attempt(index, len(attempts), False, "no_grasp", None, None, None, None, seconds))
             continue
-        target = _target(chosen, view)
-        outcome = simulator.execute(here, poses[present], hand, chosen, protocol)
-        executed = time.perf_counter()
-        row = int(outcome.object[0])
-        success = bool(outcome.success[0])
+        seen = _target(chosen, view)
+        target = None if seen is None else standing[seen]
+        outcome = simulator.execute(objects, poses, hand, chosen, protocol)
+        seconds["execute"] = time.perf_counter() - predicted
+        success, row = bool(outcome.success[0]), int(outcome.object[0])
         attempts.append(
             Attempt(
                 scene=index,
                 number=len(attempts),
                 success=success,
                 reason=Reason(int(outcome.reason[0])).name.lower(),
-                target=None if target is None else here[target].name,
-                lifted=here[row].name if success else None,
+                target=None if target is None else names[target],
+                lifted=names[row] if success else None,
                 score=float(chosen.quality[0]),
-                epsilon=None
-                if epsilon is None or target is None
-                else epsilon(here[target], poses[present[target]], chosen),
-                seconds={"render": looked - began, "predict": predicted - looked, "execute": executed - predicted},
+                epsilon=None if epsilon is None or target is None else epsilon(objects[target], poses[target], chosen),
+                seconds=seconds,
             )
         )
         if draw:
-            strips.append(
-                {"names": [item.name for item in here], "poses": poses[present], "grasp": chosen, "view": view}
-            )
-        poses[present] = outcome.final[0].to(poses)
+            strips.append({"names": names, "poses": poses.clone(), "grasp": chosen, "view": view})
+        after = outcome.final[0].to(poses)
         if success:
-            removed.append(here[row].name)
-            del present[row]
-            failed = []
-        else:
-            failed.append(chosen)
-            present = [i for i in present if _on_table(poses[i], protocol)]
+            removed.append(names[row])
+            after[row] = math.nan
+        failed = [] if success else [*failed, chosen]
+        poses = simulator.settle(objects, after, _seed(seed, "settle", index, len(attempts))).to(poses)
     return Episode(index, names, tuple(removed), tuple(attempts), tuple(strips))
+
+
+def present(poses: Float[Tensor, "O 4 4"]) -> list[int]:
+    """Return the indices of objects that are still there (pose not NaN)."""
+    return [int(i) for i in poses.flatten(1).isfinite().all(dim=1).nonzero().flatten()]
 
 
 def choose(offered: Grasps, failed: Sequence[Grasps], policy: Policy) -> Grasps | None:
@@ -218,11 +218,6 @@ def attempt_rows(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
     return [asdict(attempt) for episode in episodes for attempt in episode.attempts]
 
 
-def _nothing(scene: int, number: int, looking: float, predicting: float) -> Attempt:
-    seconds = {"render": looking, "predict": predicting}
-    return Attempt(scene, number, False, Reason.NO_GRASP.name.lower(), None, None, None, None, seconds)
-
-
 def _target(grasp: Grasps, view: View) -> int | None:
     """Return the object nearest to the grasp's known contact, or None for the table."""
     contacts = grasp.moved(inverse(view.world_T_camera.to(grasp.pose))).contacts[0]
@@ -234,5 +229,5 @@ def _target(grasp: Grasps, view: View) -> int | None:
     return instance if instance >= 0 else None
 
 
-def _on_table(pose: Float[Tensor, "4 4"], protocol: Protocol) -> bool:
-    return bool(pose.isfinite().all()) and float(pose[2, 3]) > -0.05
+def _seed(seed: int, *keys: str | int) -> int:
+    return int(stream(seed, *keys).integers(2**31))

@@ -5,6 +5,7 @@ weights do not depend on how many there are. Batch statistics are those of a mic
 anew for the averaged weights at the end. The order of views depends on seed and step only, hence resuming is exact.
 """
 
+import copy
 import math
 import os
 import signal
@@ -96,6 +97,7 @@ def _run(
     """One process of the training; rank 0 writes."""
     if world > 1:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent tells us
+        model = copy.deepcopy(model)  # what was sent here lies in memory that all processes share
         torch.set_num_threads(1 if device.type == "cpu" else torch.get_num_threads())
         backend = "nccl" if device.type == "cuda" else "gloo"
         os.environ.update(MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port))

@@ -1,0 +1,109 @@
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from dexgrasp.dataset.samples import Samples, collect
+from dexgrasp.errors import DexgraspError
+from dexgrasp.model import GraspNet
+from dexgrasp.plugins import load_backbone, load_hand, load_representation
+from dexgrasp.representation import Targets
+from dexgrasp.training.loop import train
+from dexgrasp.training.settings import TrainerSettings, order, schedule
+from dexgrasp.training.state import FILE
+
+SETTINGS = TrainerSettings(
+    steps=6, batch=4, shards=2, device="cpu", learning_rate=0.01, warmup=2, calibrate=4, save_every=1
+)
+
+
+def network():
+
+    torch.manual_seed(0)
+    backbone = load_backbone("pointnet", points=32)
+    return GraspNet(backbone, load_representation("contact", load_hand("barrett"), backbone.channels, hidden=[16]), 64)
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory) -> Samples:
+    model = network()
+    generator = torch.Generator().manual_seed(1)
+
+    def read(view: int):
+        cloud = torch.rand(64, 6, generator=generator)
+        cloud[:, 3:] /= cloud[:, 3:].norm(dim=1, keepdim=True)
+        finger = torch.randint(0, 4, (64,), generator=generator)
+        parameters = torch.rand(64, model.representation.size, generator=generator) * 0.5
+        return cloud, Targets(finger, parameters, torch.rand(64, generator=generator), torch.ones(64, dtype=torch.bool))
+
+    return collect(range(6), read, model.backbone, tmp_path_factory.mktemp("samples") / "train", "samples")
+
+
+def run(samples, folder: Path, **changes):
+
+    folder.mkdir(exist_ok=True)
+    model = network()
+    summary = train(model, samples, samples, replace(SETTINGS, **changes), seed=3, folder=folder)
+    return model.state_dict(), summary
+
+
+def same(a, b, **tolerance):
+    assert a.keys() == b.keys()
+    for key in a:
+        torch.testing.assert_close(a[key], b[key], **(tolerance or {"rtol": 0, "atol": 0}), msg=key)
+
+
+def test_resumes_exactly(samples, tmp_path):
+    whole, summary = run(samples, tmp_path / "whole", processes=1)
+    assert summary.steps == 6 and not summary.interrupted
+    import dexgrasp.training.loop as loop
+
+    class Stop:
+        def __init__(self):
+            self.asked = 0
+
+        def is_set(self):
+            self.asked += 1
+            return self.asked == 3
+
+    model, folder = network(), tmp_path / "cut"
+    folder.mkdir()
+    loop._run(0, 1, 0, model, samples, None, SETTINGS, 3, folder, torch.device("cpu"), Stop())
+    assert loop.read_tensors(folder / FILE)[1]["step"] == 3
+    resumed, _ = run(samples, folder, processes=1)
+    same(whole, resumed)
+
+
+def test_same_result_whatever_the_number_of_processes(samples, tmp_path):
+    one, _ = run(samples, tmp_path / "one", processes=1)
+    two, summary = run(samples, tmp_path / "two", processes=2)
+    assert summary.processes == 2
+    same(one, two)
+
+
+def test_loss_falls_and_log_is_whole(samples, tmp_path):
+    _, summary = run(samples, tmp_path / "long", processes=1, steps=60, log_every=1, ema=0.9)
+    rows = list(csv.DictReader((tmp_path / "long" / "metrics.csv").open()))
+    totals = [float(row["value"]) for row in rows if row["term"] == "total" and row["split"] == "train"]
+    assert len(totals) == 60
+    assert sum(totals[-5:]) < 0.8 * sum(totals[:5])
+    assert set(summary.validation) and all(value == value for value in summary.validation.values())
+
+
+def test_every_view_is_seen_once_an_epoch():
+    seen = [view for step in range(3) for shard in order(6, SETTINGS, 0, step) for view in shard]
+    assert sorted(seen[:6]) == sorted(seen[6:12]) == list(range(6))
+    assert order(6, SETTINGS, 0, 1) == order(6, SETTINGS, 0, 1) != order(6, SETTINGS, 1, 1)
+
+
+def test_schedule_warms_up_and_decays():
+    factors = [schedule(step, SETTINGS) for step in range(6)]
+    assert factors[0] == 0.5 and factors[1] == 1.0 and factors[1] >= factors[2] > factors[5] > 0
+
+
+@pytest.mark.parametrize("change", [{"shards": 3}, {"precision": "half"}, {"optimizer": "lion"}])
+def test_bad_settings_are_named(change):
+    with pytest.raises(DexgraspError):
+        TrainerSettings(**{"steps": 1, "batch": 4, "shards": 2} | change)
