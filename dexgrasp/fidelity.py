@@ -52,7 +52,7 @@ class Fidelity:
 
     representation: str
     normals: str
-    """`true`: closing's contact and the mesh's normal there; `estimated`: visible points with their estimated normals."""
+    """`true`: closing's contact and the surface's normal there; `estimated`: visible points and their normals."""
     told_from: str
     """`any`: every finger (and point) that touches; `best`: per grasp, the one that moves the base least."""
     count: int
@@ -60,9 +60,9 @@ class Fidelity:
     """Share that can be told at all."""
     truthful: float | None
     """Share that is told and still a grasp; None where nothing was closed again."""
-    distance_mm: dict[str, float]
-    """Percentiles of the base's displacement over what can be told."""
-    angle_deg: dict[str, float]
+    distance_mm: dict[str, float | None]
+    """Percentiles of the base's displacement over what can be told; None where nothing can."""
+    angle_deg: dict[str, float | None]
 
 
 def at_contacts(grasps: Grasps) -> Pairs:
@@ -137,14 +137,15 @@ def cells(row: Fidelity) -> list[str]:
     """Return a row's cells as text, in the order of `HEADER`."""
     truthful = "" if row.truthful is None else f"{100 * row.truthful:.1f}"
     lead = [row.representation, row.normals, row.told_from, str(row.count), f"{100 * row.encodable:.1f}", truthful]
-    return lead + [f"{value:.2f}" for value in (*row.distance_mm.values(), *row.angle_deg.values())]
+    values = (*row.distance_mm.values(), *row.angle_deg.values())
+    return lead + ["-" if value is None else f"{value:.2f}" for value in values]
 
 
 def _share(mask: Tensor) -> float:
     return float(mask.double().mean()) if len(mask) else 0.0
 
 
-def _percentiles(values: Tensor) -> dict[str, float]:
+def _percentiles(values: Tensor) -> dict[str, float | None]:
     if not len(values):
-        return {f"p{p}": float("nan") for p in PERCENTILES}
+        return {f"p{p}": None for p in PERCENTILES}
     return {f"p{p}": float(np.percentile(values.double().numpy(), p)) for p in PERCENTILES}

@@ -41,7 +41,7 @@ def ball_view(count=1500, noise=0.0):
 
 
 def ball_grasps(hand, count=200, seed=0, tilt=0.0):
-    """Grasps of which one finger touches the ball; `tilt` leans the hand over at the contact, off the manifold (rad)."""
+    """Grasps of which one finger touches the ball; `tilt` (rad) leans the hand over, off the manifold."""
     generator = torch.Generator().manual_seed(seed)
     normals = normalize(torch.randn(count, 3, generator=generator), dim=-1)
     points, finger = CENTRE + RADIUS * normals, torch.arange(count) % 3
