@@ -284,11 +284,17 @@ def read(path: Path) -> dict[str, Any]:
 
 def _resolved(kind: str, config: Mapping[str, Any]) -> dict[str, Any]:
     from omegaconf import DictConfig, OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
 
     import dexgrasp.config  # noqa: F401  registers the resolver that such a config may use
 
     node = config if isinstance(config, DictConfig) else OmegaConf.create(dict(config))
-    options = OmegaConf.to_container(node, resolve=True)
+    try:
+        options = OmegaConf.to_container(node, resolve=True)
+    except OmegaConfBaseException as error:
+        if isinstance(error.__cause__, DexgraspError):  # from our resolver
+            raise error.__cause__ from None
+        raise DexgraspError(f"a {kind} config without open ends", str(error.msg or error), "give that key") from error
     if not isinstance(options, dict) or not options.get("name"):
         raise DexgraspError(f"a {kind} config with the key `name`", f"{sorted(map(str, config))}", "add `name: ...`")
     return {str(key): value for key, value in options.items()}

@@ -150,9 +150,10 @@ class Forgetful(Backbone):
         return {"seeds": torch.randperm(len(points))[:16]}
 
     def forward(self, cloud, plan=None):
-        seeds = torch.arange(16).expand(len(cloud), -1)
+        seeds = torch.randperm(cloud.shape[1])[:16].expand(len(cloud), -1)
         return self.layer(cloud)[:, :16] + cloud.mean(), seeds
 
 
 def test_a_bad_backbone_breaks_every_law():
-    assert all(error for _, error in violations("backbone", Forgetful()))
+    holds = [law.__name__ for law, error in violations("backbone", Forgetful()) if error is None]
+    assert holds == []
