@@ -4,6 +4,7 @@ import pytest
 import torch
 from dexgrasp_pointnet2 import PointNet2
 from dexgrasp_pointnet2.layers import FeaturePropagation, SetAbstraction
+from dexgrasp_pointnet2.pooling import ball_max, ball_max_reference
 
 from dexgrasp.errors import DexgraspError
 
@@ -101,6 +102,21 @@ def test_factorised_equals_grouped_where_the_max_comes_last():
     factorised.load_state_dict(grouped.state_dict())  # one set of parameters serves both
     data = torch.rand(50, 3), torch.randn(50, 5), torch.rand(7, 3), torch.randint(50, (7, 6))
     torch.testing.assert_close(grouped(*data), factorised(*data))
+
+
+@pytest.mark.parametrize("integer", [torch.int16, torch.int32, torch.int64])
+def test_compiled_maximum_equals_torch(integer):
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randn(60, 9, generator=generator).round(decimals=1).requires_grad_()
+    group = torch.randint(60, (25, 7), generator=generator)
+    group[5, 3:] = group[5, 0]  # padded
+    weight = torch.randn(25, 9, generator=generator)
+    expected = ball_max_reference(rows, group)
+    assert torch.equal(ball_max(rows, group.to(integer)), expected)
+    distinct = torch.randn(60, 9, generator=generator, requires_grad=True)  # ties may go to either
+    (gradient,) = torch.autograd.grad((ball_max(distinct, group) * weight).sum(), distinct)
+    (expected,) = torch.autograd.grad((ball_max_reference(distinct, group) * weight).sum(), distinct)
+    torch.testing.assert_close(gradient, expected)
 
 
 def test_propagation_interpolates():

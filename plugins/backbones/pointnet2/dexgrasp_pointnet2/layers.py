@@ -8,6 +8,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from dexgrasp_pointnet2.pooling import ball_max
+
 
 def mlp(widths: Sequence[int]) -> nn.Sequential:
     """Return linear layers from widths[0] to widths[-1], each with batch norm and ReLU; no bias before a norm."""
@@ -46,14 +48,12 @@ class SetAbstraction(nn.Module):
         with torch.autocast(points.device.type, enabled=False):
             rows = self.feature(features.float()) + self.position(points)
             origin = self.position(centres)
-            if self.factorised:
-                rows = F.embedding_bag(group, rows, mode="max") - origin
-            else:
-                rows = (rows[group] - origin[:, None]).flatten(0, 1)
+            rows = ball_max(rows, group) if self.factorised else F.embedding(group, rows)
+            rows = (rows - origin.reshape(len(group), *[1] * (rows.dim() - 2), -1)).flatten(0, -2)
         rows = F.relu(self.norm(rows))
         if self.factorised:
             return rows + self.rest(rows) if self.residual else self.rest(rows)
-        return self.rest(rows).unflatten(0, group.shape).amax(dim=1)
+        return self.rest(rows).unflatten(0, group.shape).max(dim=1).values
 
 
 class FeaturePropagation(nn.Module):
