@@ -18,7 +18,7 @@ PIPELINES = {
 
 TOOLS = {
     "plugins": "list installed hands, representations and backbones",
-    "hand": "make or check a hand: hand init, hand check",
+    "hand": "try the laws on a hand: hand check <name>",
     "report": "write the report of a run again",
 }
 """Ordinary arguments."""
