@@ -37,6 +37,9 @@ class Contact(Representation):
         huber: residual (in bins) at which the residual's loss turns from quadratic to linear.
     """
 
+    label_options: tuple[str, ...] = ()
+    """Options on which the numbers in `Targets` depend: none, bins are made of angles by the loss."""
+
     def __init__(
         self,
         hand: Hand,

@@ -33,6 +33,9 @@ class Pose(Representation):
         huber: residual (in bins) at which the residual's loss turns from quadratic to linear.
     """
 
+    label_options: tuple[str, ...] = ("scale",)
+    """Options on which the numbers in `Targets` depend."""
+
     def __init__(
         self,
         hand: Hand,
