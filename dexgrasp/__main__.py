@@ -23,6 +23,9 @@ TOOLS = {
 }
 """Ordinary arguments."""
 
+VERBS = {"dataset": ("inspect", "verify")}
+"""First words that make a pipeline's command a tool: the module's `tool(arguments)` runs it."""
+
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; return the exit status (2 for a user's error, 130 for Ctrl-C)."""
@@ -34,6 +37,8 @@ def main(argv: list[str] | None = None) -> int:
             return 0
         if command in TOOLS:
             return int(import_module(f"dexgrasp.commands.{command}").main(rest) or 0)
+        if rest[:1] and rest[0] in VERBS.get(command, ()):
+            return int(import_module(f"dexgrasp.commands.{command}").tool(rest) or 0)
         if command in PIPELINES:
             return pipeline(command, rest)
         from dexgrasp.plugins import unknown

@@ -69,6 +69,9 @@ def test_misses_and_range() -> None:
     near = Camera(**{**CAMERA.__dict__, "far": 0.45})
     seen = RayScene(meshes, poses).render(near, look_at(torch.tensor([0.0, 0, 0.5]), torch.zeros(3)))
     assert set(np.unique(seen.instance)) == {NOTHING, 0, 1} and seen.depth.max() <= 0.45
+    poses[0] = torch.nan
+    left = RayScene(meshes, poses).render(CAMERA, look_at(torch.tensor([0.0, 0, 0.5]), torch.zeros(3)))
+    assert set(np.unique(left.instance)) == {TABLE, 1}, "absent objects are not seen, the others keep their numbers"
 
 
 def test_viewpoints_keep_their_bounds() -> None:

@@ -52,18 +52,22 @@ class RayScene:
     """Meshes at rest on a table (z = 0), ready to be seen from anywhere. Built once, rendered often."""
 
     def __init__(self, meshes: Sequence[trimesh.Trimesh], poses: Float[Tensor, "O 4 4"], table: float = 2.0) -> None:
-        """`poses` is world_T_object; `table` the side of the square table about the world's origin, m (0: none)."""
+        """`poses` is world_T_object, NaN for objects that are not there; they keep their numbers.
+
+        `table` is the side of the square table about the world's origin, m (0: none).
+        """
         self._scene = EmbreeScene()
         self._meshes: list[TriangleMesh] = []
-        for mesh, pose in zip(meshes, poses.double().numpy(), strict=True):
-            vertices = mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
-            self._add(vertices, mesh.faces)
-        self._objects = len(self._meshes)
+        self._instances: list[int] = []
+        for number, (mesh, pose) in enumerate(zip(meshes, poses.double().numpy(), strict=True)):
+            if np.isfinite(pose).all():
+                self._add(mesh.vertices @ pose[:3, :3].T + pose[:3, 3], mesh.faces, number)
         if table > 0:
             corners = 0.5 * table * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-            self._add(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+            self._add(corners, np.array([[0, 1, 2], [0, 2, 3]]), TABLE)
 
-    def _add(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+    def _add(self, vertices: np.ndarray, faces: np.ndarray, instance: int) -> None:
+        self._instances.append(instance)
         triangles = np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32)
         self._meshes.append(TriangleMesh(self._scene, *triangles))
 
@@ -76,7 +80,7 @@ class RayScene:
         hit = self._scene.run(eye, rays @ rotation.T, output=1)  # type: ignore[call-arg]
         depth, instance = hit["tfar"], hit["geomID"]
         seen = (instance >= 0) & (depth >= camera.near) & (depth <= camera.far)
-        instance = np.where(instance < self._objects, instance, TABLE)
+        instance = np.array([*self._instances, NOTHING])[instance]  # embree says -1 for a miss
         normals = hit["Ng"] @ rotation
         normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-30
         normals *= -np.sign((normals * rays).sum(axis=1, keepdims=True))

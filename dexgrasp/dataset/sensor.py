@@ -8,10 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numba
 import numpy as np
 import torch
 import trimesh
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from dexgrasp.dataset.camera import NOTHING, TABLE, Camera, RayScene, Rendering
@@ -140,11 +142,8 @@ def observe(
     `instance` is only carried along. Fewer pixels than points are drawn repeatedly.
     """
     pose = world_T_camera.double().numpy()
-    pixels = np.flatnonzero((depth.ravel() > 0) & np.isfinite(depth.ravel()))
-    points = camera.rays()[pixels] * depth.ravel()[pixels, None]
-    world = points @ pose[:3, :3].T.astype(np.float32) + pose[:3, 3].astype(np.float32)
-    inside = ((world >= framing.low) & (world <= framing.high)).all(axis=1)
-    pixels, points = pixels[inside], points[inside]
+    box = np.array([framing.low, framing.high])
+    pixels, points = _crop(depth.astype(np.float64), camera.fx, camera.fy, camera.cx, camera.cy, pose, box)
     if len(pixels) < 32:
         remedy = "aim the camera at the table, or set framing.low and framing.high to where the objects are"
         raise DexgraspError("at least 32 measured points in the workspace", str(len(pixels)), remedy)
@@ -158,6 +157,32 @@ def observe(
         instance=torch.from_numpy(np.where(labels == NOTHING, TABLE, labels).astype(np.int64)),
         world_T_camera=world_T_camera.float(),
     )
+
+
+@numba.njit(cache=True)
+def _crop(
+    depth: NDArray, fx: float, fy: float, cx: float, cy: float, pose: NDArray, box: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Return the pixels (row * W + column) whose points lie in the box of the world, and the points (camera frame)."""
+    pixels = np.empty(depth.size, np.int64)
+    points = np.empty((depth.size, 3), np.float32)
+    count = 0
+    point = np.empty(3)
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            z = depth[row, column]
+            if not (z > 0 and z < np.inf):
+                continue
+            point[0], point[1], point[2] = (column - cx) / fx * z, (row - cy) / fy * z, z
+            inside = True
+            for k in range(3):
+                world = pose[k, 0] * point[0] + pose[k, 1] * point[1] + pose[k, 2] * point[2] + pose[k, 3]
+                inside = inside and box[0, k] <= world <= box[1, k]
+            if inside:
+                pixels[count] = row * depth.shape[1] + column
+                points[count] = point
+                count += 1
+    return pixels[:count].copy(), points[:count].copy()
 
 
 def downsample(

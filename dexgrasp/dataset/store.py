@@ -142,6 +142,11 @@ class Store:
         self._reindex()
         self._save()
 
+    def annotate(self, **facts: Any) -> None:
+        """Enter facts about the whole store into the manifest, beside its own keys."""
+        self.manifest |= facts
+        self._save()
+
     def __len__(self) -> int:
         return len(self._index)
 
