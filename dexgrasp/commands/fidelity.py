@@ -31,7 +31,7 @@ def main(config: DictConfig) -> None:
     dataset = pipeline.ensure(config.dataset, config.hand)
     names = list(config.representations or plugins.names("repr"))
     models = {name: plugins.load_representation(name, dataset.hand) for name in names}
-    table = []
+    table: list[fidelity.Fidelity] = []
     kinds: dict[str, Callable[[], Iterator[Draw]]] = {
         "true": lambda: _objects(dataset, config),
         "estimated": lambda: _views(dataset, config),
