@@ -26,6 +26,7 @@ def package(name: str) -> str:
 
 # At import, so that it is there in every worker process that unpickles a task or a config.
 OmegaConf.register_new_resolver("package", package, replace=True)
+OmegaConf.register_new_resolver("first", lambda *values: next((v for v in values if v is not None), None), replace=True)
 
 
 def conf_folder() -> Path:

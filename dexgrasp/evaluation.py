@@ -202,7 +202,9 @@ def summarise(episodes: Sequence[Episode], seed: int) -> dict[str, Any]:
         ),
         "reasons": dict(Counter(attempt.reason for attempt in attempts)),
         "seconds": {
-            stage: float(np.median([a.seconds[stage] for a in attempts if stage in a.seconds] or [math.nan]))
+            stage: float(np.median(times))
+            if (times := [a.seconds[stage] for a in attempts if stage in a.seconds])
+            else None
             for stage in ("render", "predict", "execute")
         },
     }

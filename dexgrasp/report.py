@@ -8,26 +8,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float, UInt8
-from torch import Tensor
+from jaxtyping import UInt8
 
+from dexgrasp.checkpoint import replace_file
 from dexgrasp.evaluation import Episode
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.objects import ObjectSet
-from dexgrasp.picture import picture
-from dexgrasp.scene import View
+from dexgrasp.picture import look_at, picture
 
-SCHEMA = "dexgrasp.evaluation/1"
 PALETTE = ((0.86, 0.45, 0.35), (0.40, 0.62, 0.80), (0.55, 0.74, 0.44), (0.85, 0.70, 0.35), (0.62, 0.52, 0.76))
 HAND = (0.35, 0.37, 0.42)
 
 
-def write_results(folder: Path, results: Mapping[str, Any]) -> Path:
-    """Write results.json; the schema is documented in docs/results.md."""
+def write_results(folder: Path, kind: str, results: Mapping[str, Any]) -> Path:
+    """Write results.json of a command; the schemas are documented in docs/results.md."""
     path = folder / "results.json"
-    path.write_text(json.dumps({"schema": SCHEMA, **results}, indent=1, allow_nan=False, default=str))
+    content = {"schema": f"dexgrasp.{kind}/1", **results}
+    replace_file(path, (json.dumps(content, indent=1, allow_nan=False, default=str) + "\n").encode())
     return path
 
 
@@ -123,32 +121,21 @@ def draw_attempts(
 
 
 def draw_grasp(
-    strip: Mapping[str, Any], objects: ObjectSet, hand: Hand, size: tuple[int, int] = (320, 240)
+    strip: Mapping[str, Any], objects: ObjectSet, hand: Hand, size: tuple[int, int] = (240, 320)
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Render a scene with the hand at one grasp, seen from the camera's side."""
+    """Render a scene with the hand at one grasp, seen from the camera's side, closer and lower."""
     grasp: Grasps = strip["grasp"]
-    meshes = [
+    bodies = [
         (objects[name].mesh, pose.double().numpy(), PALETTE[i % len(PALETTE)])
         for i, (name, pose) in enumerate(zip(strip["names"], strip["poses"], strict=True))
+        if pose.isfinite().all()
     ]
-    links = hand.link_poses(grasp.joints.double())
-    base = grasp.pose[0].double()
-    meshes += [(mesh, (base @ links[link][0]).numpy(), HAND) for link, mesh in hand.visuals.items()]
-    return picture(meshes, viewpoint(strip["view"], grasp), size)
-
-
-def viewpoint(view: View, grasp: Grasps) -> Float[Tensor, "4 4"]:
-    """Return world_T_camera of a picture: from the view's side, closer to the grasp and lower."""
-    at = grasp.pose[0, :3, 3].double() * 0.5
-    away = view.world_T_camera[:3, 3].double() - at
-    away[2] = away[2].clamp(max=float(torch.linalg.vector_norm(away[:2])) * 0.7)
-    eye = at + away / torch.linalg.vector_norm(away) * 0.62
-    z = (at - eye) / torch.linalg.vector_norm(at - eye)
-    x = torch.linalg.cross(z, z.new_tensor([0.0, 0.0, 1.0]))
-    x = x / torch.linalg.vector_norm(x)
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3], pose[:3, 3] = torch.stack([x, torch.linalg.cross(z, x), z], dim=1), eye
-    return pose
+    links, base = hand.link_poses(grasp.joints.double()), grasp.pose[0].double()
+    bodies += [(mesh, (base @ links[link][0]).numpy(), HAND) for link, mesh in hand.visuals.items()]
+    at = base[:3, 3].numpy() * 0.5
+    away = strip["view"].world_T_camera[:3, 3].double().numpy() - at
+    away[2] = min(away[2], 0.7 * float(np.linalg.norm(away[:2])))
+    return picture(bodies, look_at((at + 0.62 * away / np.linalg.norm(away)).tolist(), at.tolist()), size)
 
 
 def _mosaic(path: Path, tiles: Sequence[tuple[str, UInt8[np.ndarray, "H W 3"]]]) -> Path:

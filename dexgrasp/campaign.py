@@ -1,0 +1,144 @@
+"""An evaluation in full: every held-out scene cleared, beside the ceilings that its labels set."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import joblib
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dexgrasp.dataset.camera import Viewpoints
+from dexgrasp.dataset.dataset import Dataset
+from dexgrasp.dataset.sensor import Framing, Sensor, capture
+from dexgrasp.evaluation import Episode, Policy, attempt_rows, ceilings, clear, rate, summarise
+from dexgrasp.execution import pregrasp
+from dexgrasp.geometry import inverse
+from dexgrasp.grasps import Grasps
+from dexgrasp.model import GraspNet, load_model
+from dexgrasp.objects import Object
+from dexgrasp.progress import track
+from dexgrasp.quality import epsilon, wrenches
+from dexgrasp.scene import View
+from dexgrasp.seeds import stream
+from dexgrasp.selection import Selection
+from dexgrasp.simulation.mujoco import MujocoSimulator
+from dexgrasp.simulation.protocol import Protocol
+from dexgrasp.statistics import bootstrap_ratio
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """What is evaluated on what; small enough to be sent to worker processes."""
+
+    dataset: Dataset
+    """Held-out objects with their grasps and scenes."""
+    protocol: Protocol
+    model: Path
+    policy: Policy
+    selection: Selection
+    top_k: int
+    seed: int
+    drawn: int = 8
+    """Scenes whose attempts are kept for pictures."""
+
+    def run(self, workers: int, label_ceilings: bool = True) -> tuple[list[Episode], dict[str, Any]]:
+        """Clear all scenes; return the episodes and the machine-readable results.
+
+        The verdicts do not depend on the number of workers.
+        """
+        count = self.dataset.scenes
+        parallel = joblib.Parallel(n_jobs=workers, return_as="generator")
+        jobs = (joblib.delayed(_work)(self, index, label_ceilings) for index in range(count))
+        done = list(track(parallel(jobs), f"evaluation, {self.protocol.name}", total=count))
+        episodes = [episode for episode, _ in done]
+        results: dict[str, Any] = {
+            "protocol": str(self.protocol),
+            "protocol_values": asdict(self.protocol),
+            "policy": asdict(self.policy),
+            "selection": asdict(self.selection),
+            "top_k": self.top_k,
+            "seed": self.seed,
+            "summary": summarise(episodes, self.seed),
+            "attempts": attempt_rows(episodes),
+        }
+        if label_ceilings:
+            results["ceilings"] = _ceiling_rates([verdicts for _, verdicts in done], self.seed)
+        return episodes, results
+
+    def look(self, scene: int, objects: list[Object], poses: Float[Tensor, "O 4 4"], seed: int) -> View:
+        """Return what the scene's fixed camera sees, with fresh noise."""
+        config = self.dataset.config
+        camera = _settings(Viewpoints, config["views"]["viewpoints"]).draw(stream(self.seed, "viewpoint", scene))
+        framing = _settings(Framing, config["views"]["framing"])
+        meshes = [item.mesh for item in objects]
+        return capture(meshes, poses, camera, Sensor.build(config["camera"]), framing, stream(seed, "sensor"))
+
+    def predict(self, view: View) -> Grasps:
+        """Return the network's grasps, camera frame."""
+        return _network(self.model).predict(view.points, view.normals, self.top_k, self.selection, self.seed)
+
+    def reached(self, item: Object, pose: Float[Tensor, "4 4"], grasp: Grasps) -> float:
+        """Return epsilon of the contacts in which the fingers end on the true mesh, torque about its centre of mass."""
+        dataset, synthesis = self.dataset, self.dataset.config["synthesis"]
+        _, opened = pregrasp(dataset.hand, grasp, opening=self.protocol.motion.opening)
+        base = inverse(pose.double()) @ grasp.pose.double()
+        closure = dataset.closer.close(dataset.field(dataset.objects.names.index(item.name)), base, opened.double())
+        cones = wrenches(
+            closure.contacts, closure.normals, item.com, item.radius, synthesis["friction"], synthesis["edges"]
+        )
+        return float(epsilon(cones)[0])
+
+
+def _work(campaign: Campaign, index: int, label_ceilings: bool) -> tuple[Episode, dict[str, list[bool]]]:
+    """One scene; the worker's only entry."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        dataset = campaign.dataset
+        simulator = MujocoSimulator(dataset.config["simulator"]["settling"])
+        objects = [dataset.objects[name] for name in dataset.scene(index).objects]
+        poses = dataset.scene(index).poses.double()
+        common = (dataset.hand, simulator, campaign.protocol)
+        verdicts = (
+            ceilings(index, objects, poses, dataset.scene_grasps(index), *common, campaign.seed)
+            if label_ceilings
+            else {}
+        )
+        episode = clear(
+            index,
+            objects,
+            poses,
+            dataset.hand,
+            partial(campaign.look, index),
+            campaign.predict,
+            simulator,
+            campaign.protocol,
+            campaign.policy,
+            campaign.seed,
+            campaign.reached,
+            draw=index < campaign.drawn,
+        )
+        return episode, verdicts
+    finally:
+        torch.set_num_threads(threads)
+
+
+@lru_cache(1)
+def _network(path: Path) -> GraspNet:
+    return load_model(path)
+
+
+def _ceiling_rates(verdicts: list[dict[str, list[bool]]], seed: int) -> dict[str, Any]:
+    rates = {}
+    for kind in verdicts[0] if verdicts else {}:
+        wins, tries = [sum(v[kind]) for v in verdicts], [len(v[kind]) for v in verdicts]
+        rates[kind] = rate(float(sum(wins)), sum(tries), bootstrap_ratio(wins, tries, seed))
+    return rates
+
+
+def _settings(kind: Any, config: Mapping[str, Any]) -> Any:
+    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in config.items()})

@@ -1,0 +1,69 @@
+"""python -m dexgrasp eval: a trained network in physics, closed loop."""
+
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from dexgrasp.campaign import Campaign
+from dexgrasp.checkpoint import find_checkpoint, read_tensors
+from dexgrasp.dataset.pipeline import ensure
+from dexgrasp.evaluation import Policy
+from dexgrasp.report import draw_attempts, rows, write_report, write_results
+from dexgrasp.selection import Selection
+from dexgrasp.simulation.protocol import load_protocol
+
+
+def main(config: DictConfig) -> None:
+    """Evaluate `config.model` and print where the report lies."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    checkpoint = find_checkpoint(config.model)
+    hand = read_tensors(checkpoint)[1]["config"]["hand"]
+    results = evaluate(config, hand, checkpoint, folder)
+    print(text(results))
+    print(f"report: {folder / 'report.html'}\n{folder}")
+
+
+def evaluate(config: DictConfig, hand: Mapping[str, Any], checkpoint: Path, folder: Path) -> dict[str, Any]:
+    """Make the held-out scenes where they are missing, clear them, write results and report into `folder`."""
+    began = time.perf_counter()
+    options = OmegaConf.to_container(config.evaluation, resolve=True)
+    assert isinstance(options, dict)
+    dataset = ensure(config.evaluation.dataset, hand)
+    made = time.perf_counter()
+    campaign = Campaign(
+        dataset=dataset,
+        protocol=load_protocol(OmegaConf.to_container(config.protocol)),  # type: ignore[arg-type]
+        model=checkpoint.absolute(),
+        policy=Policy(**options["policy"]),
+        selection=Selection(**OmegaConf.to_container(config.selection)),  # type: ignore[arg-type]
+        top_k=options["top_k"],
+        seed=config.seed,
+        drawn=options["drawn"],
+    )
+    workers = options["workers"] or len(os.sched_getaffinity(0))
+    episodes, results = campaign.run(workers, options["ceilings"])
+    results = {
+        "title": f"{campaign.protocol.name}: {checkpoint.parent.name}",
+        "model": str(checkpoint),
+        "objects": options["dataset"]["objects"],
+        "scenes": options["dataset"]["scenes"],
+        "times": {"data": made - began, "episodes": time.perf_counter() - made},
+        **results,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    write_results(folder, "evaluation", results)
+    write_report(folder, results, draw_attempts(folder, episodes, dataset.objects, dataset.hand))
+    return results
+
+
+def text(results: Mapping[str, Any]) -> str:
+    """Return the summary as a table for the terminal."""
+    lines = [f"{results['protocol']}, seed {results['seed']}, {results['summary']['scenes']} scenes"]
+    lines += [f"  {what:34}{value:22}{count}" for what, value, count in rows(results)]
+    reasons = ", ".join(f"{name} {count}" for name, count in sorted(results["summary"]["reasons"].items()))
+    return "\n".join([*lines, f"  outcomes: {reasons}"])

@@ -1,0 +1,122 @@
+"""python -m dexgrasp train: data, training, evaluation in physics, report."""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from dexgrasp.checkpoint import FILE, check_hand, find_checkpoint, load_state, read_tensors
+from dexgrasp.commands.eval import evaluate, text
+from dexgrasp.comparison import compare as compare_runs
+from dexgrasp.comparison import read_run
+from dexgrasp.dataset.dataset import Dataset
+from dexgrasp.dataset.pipeline import ensure, summary, table
+from dexgrasp.dataset.samples import Samples, collect
+from dexgrasp.dataset.store import digest
+from dexgrasp.errors import DexgraspError
+from dexgrasp.model import GraspNet, build_model, save_model
+from dexgrasp.report import write_results
+from dexgrasp.representation import Targets
+from dexgrasp.seeds import stream
+from dexgrasp.training.loop import train
+from dexgrasp.training.settings import TrainerSettings
+
+CONFIG = "config.yaml"
+"""The whole config of a training, in its folder; what `resume` goes on with."""
+
+
+def main(config: DictConfig) -> None:
+    """Run the main job; everything it writes but the shared data lies in one folder."""
+    began = time.perf_counter()
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    config = _begin(config, folder)
+    settings = TrainerSettings(**OmegaConf.to_container(config.trainer))  # type: ignore[arg-type]
+    torch.manual_seed(int(stream(config.seed, "weights").integers(2**31)))
+    dataset = ensure(config.dataset, config.hand, config.repr)
+    print(table(summary(dataset)))
+    model = build_model(config, dataset.config["views"]["framing"]["points"], dataset.hand)
+    _init_from(model, config.init_from)
+    made = time.perf_counter()
+    splits = {name: samples(dataset, model, name) for name in ("train", "validation") if dataset.split(name)}
+    print(f"{len(splits['train'])} views, {splits['train'].graspable:.1%} of the seed points graspable")
+    collected = time.perf_counter()
+    trained = train(model, splits["train"], splits.get("validation"), settings, config.seed, folder)
+    if trained.interrupted:
+        print(f"interrupted after {trained.steps} steps; go on with: python -m dexgrasp train resume={folder}")
+        raise KeyboardInterrupt
+    results: dict[str, Any] = {
+        "title": f"{config.hand.name}, {config.repr.name}, {config.backbone.name}, seed {config.seed}",
+        "model": {"file": FILE, "parameters": sum(p.numel() for p in model.parameters())},
+        "training": dataclasses.asdict(trained),
+        "seed": config.seed,
+        "times": {
+            "data": made - began,
+            "samples": collected - made,
+            "training": time.perf_counter() - collected,
+        },
+    }
+    facts = {"seed": config.seed, "steps": trained.steps, "validation": trained.validation}
+    save_model(folder / FILE, model.cpu(), facts)
+    if config.evaluate:
+        evaluation = evaluate(config, config.hand, folder / FILE, folder / "evaluation")
+        results["evaluation"] = {key: value for key, value in evaluation.items() if key != "attempts"}
+        results["times"]["evaluation"] = time.perf_counter() - collected - results["times"]["training"]
+        print(text(evaluation))
+    write_results(folder, "training", results)
+    stages = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in results["times"].items())
+    print(f"{stages}; {time.perf_counter() - began:.0f} s in all")
+    print(f"model: {folder / FILE}")
+    if config.evaluate:
+        print(f"report: {folder / 'evaluation' / 'report.html'}")
+    print(folder)
+
+
+def compare(folder: Path) -> None:
+    """After a multirun: one table over its runs."""
+    runs = []
+    for job in sorted(folder.iterdir(), key=lambda path: (len(path.name), path.name)):
+        overrides = job / ".hydra" / "overrides.yaml"
+        if (job / "results.json").is_file() and overrides.is_file():
+            runs.append(read_run(job, list(OmegaConf.load(overrides))))
+    if runs and all("evaluation" in run.results for run in runs):
+        path = compare_runs(runs, folder)
+        print(path.read_text().rsplit("![]", 1)[0])
+        print(path)
+
+
+def samples(dataset: Dataset, model: GraspNet, split: str) -> Samples:
+    """Return what training reads of a split; kept beside the dataset's stages."""
+
+    def read(view: int) -> tuple[torch.Tensor, Targets]:
+        seen = dataset.view(view)
+        return torch.cat([seen.points, seen.normals], dim=1), dataset.labels(view).targets(len(seen))
+
+    labels = dataset.folders["labels"]
+    views = dataset.split(split)
+    name = digest([labels.name, OmegaConf.to_container(model.config["backbone"]), split, len(views)])
+    return collect(views, read, model.backbone, labels.parent / f"samples-{name}", f"samples, {split}")
+
+
+def _begin(config: DictConfig, folder: Path) -> DictConfig:
+    """Keep the config in the run's folder, or take the one that lies there."""
+    path = folder / CONFIG
+    if config.resume is not None:
+        if not path.is_file():
+            raise DexgraspError(f"the folder of a training with {CONFIG}", f"none in {folder}", "check `resume`")
+        kept = OmegaConf.load(path)
+        assert isinstance(kept, DictConfig)
+        return kept
+    OmegaConf.save(config, path)
+    return config
+
+
+def _init_from(model: GraspNet, source: str | None) -> None:
+    if source is not None:
+        path = find_checkpoint(source)
+        tensors, notes = read_tensors(path)
+        check_hand(model.hand, notes["hand"], path)
+        load_state(model, tensors, path)
