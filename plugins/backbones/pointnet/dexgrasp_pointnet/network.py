@@ -26,7 +26,7 @@ class PointNet(Backbone):
         self,
         points: int = 2048,
         local: Sequence[int] = (64, 64),
-        summary: Sequence[int] = (128, 512),
+        summary: Sequence[int] = (128, 256),
         head: Sequence[int] = (256, 128),
     ) -> None:
         super().__init__()

@@ -1,0 +1,1 @@
+"""Measurements of speed; run each from the repository, e.g. `python -m benchmarks.backbone`."""
