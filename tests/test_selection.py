@@ -1,0 +1,95 @@
+"""Selection: what collides is not offered, what is offered differs, and the best come first."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dexgrasp import load_hand
+from dexgrasp.collision import HandShape
+from dexgrasp.execution import pregrasp
+from dexgrasp.grasps import Grasps
+from dexgrasp.selection import Selection, free, select
+
+ALL = Selection(depth=None, table=None, distance=0.0)
+FAR = torch.tensor([[0.0, 0.0, 5.0]])
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return load_hand("barrett")
+
+
+@pytest.fixture(scope="module")
+def shape(hand):
+    return HandShape(hand)
+
+
+def above(hand, heights: list[float], quality: list[float] | None = None, bend: float = 0.8) -> Grasps:
+    """Grasps from straight above, the palm's face `heights` over z = 0 (z up), fingers bent by `bend`."""
+    pose = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).repeat(len(heights), 1, 1)
+    pose[:, 2, 3] = torch.tensor(heights) + float(hand.base_T_palm[2, 3])
+    joints = torch.tensor([0.5, bend, bend, bend]).repeat(len(heights), 1)
+    return Grasps.build(pose, joints, 3, quality=torch.tensor(quality or [0.5] * len(heights)))
+
+
+def test_free_of_points(hand, shape):
+    grasps = above(hand, [0.2])
+    selection = Selection(table=None)
+    palm = grasps.pose[0, :3, 3] - torch.tensor([0.0, 0.0, 0.06])  # inside the palm
+    behind = grasps.pose[0, :3, 3] + torch.tensor([0.0, 0.0, 0.03])  # only met on the way
+    tips = grasps.pose @ hand.fingertips(grasps.joints)[0]
+    opened = pregrasp(hand, grasps, 0.0)[1]
+    cases = {"nothing": (FAR, True), "palm": (palm[None], False), "way": (behind[None], False)}
+    cases["where fingers close"] = (tips[:, :3, 3], True)
+    cases["where fingers open"] = ((grasps.pose @ hand.fingertips(opened)[0])[:, :3, 3], False)
+    for name, (points, expected) in cases.items():
+        assert bool(free(hand, shape, grasps, points, None, selection)) == expected, name
+    at_rest = replace(selection, retreat=0.0)
+    assert bool(free(hand, shape, grasps, behind[None], None, at_rest))
+
+
+def test_free_of_the_table(hand, shape):
+    table = torch.eye(4).double()
+    lowest = float(shape.table_distance(above(hand, [0.0]).pose, above(hand, [0.0]).joints))
+    opened = pregrasp(hand, above(hand, [0.0]), 0.0)[1]
+    lowest = min(lowest, float(shape.table_distance(above(hand, [0.0]).pose, opened)))
+    grasps = above(hand, [-lowest + 0.003, -lowest - 0.001, -lowest - 0.003])
+    assert free(hand, shape, grasps, FAR, table, Selection()).tolist() == [True, True, False]
+    assert free(hand, shape, grasps, FAR, None, Selection()).all()
+
+
+def test_select_sorts_limits_and_drops(hand):
+    grasps = above(hand, [0.1, 0.2, 0.3, 0.4, 0.5], [0.2, 0.9, 0.4, 0.8, 0.6])
+    grasps.pose[3, 0, 3] = float("nan")
+    cloud = torch.cat([FAR, torch.tensor([[0.0, 0, -1]])], dim=1)
+    assert select(hand, grasps, cloud, 9, ALL).quality.tolist() == pytest.approx([0.9, 0.6, 0.4, 0.2])
+    assert select(hand, grasps, cloud, 2, ALL).quality.tolist() == pytest.approx([0.9, 0.6])
+    assert select(hand, grasps, cloud, 9, replace(ALL, min_score=0.5)).quality.tolist() == pytest.approx([0.9, 0.6])
+    assert select(hand, grasps, cloud, 9, replace(ALL, candidates=3)).quality.tolist() == pytest.approx([0.9, 0.6, 0.4])
+    assert len(select(hand, grasps[:0], cloud, 9, ALL)) == 0
+
+
+def test_select_drops_the_alike(hand):
+    grasps = above(hand, [0.2, 0.205, 0.3, 0.2], [0.9, 0.8, 0.7, 0.6])
+    half = torch.tensor(1.0)
+    grasps.pose[3, :2, :2] = (
+        torch.tensor([[half.cos(), -half.sin()], [half.sin(), half.cos()]]) @ grasps.pose[3, :2, :2]
+    )
+    cloud = torch.cat([FAR, torch.tensor([[0.0, 0, -1]])], dim=1)
+    kept = select(hand, grasps, cloud, 9, Selection(depth=None, table=None))
+    assert kept.quality.tolist() == pytest.approx([0.9, 0.7, 0.6])  # the second is 5 mm from the first, not turned
+
+
+def test_select_checks_lazily_what_free_checks_eagerly(hand, shape):
+    generator = torch.Generator().manual_seed(0)
+    heights = (torch.rand(200, generator=generator) * 0.3).tolist()
+    grasps = above(hand, heights, torch.rand(200, generator=generator).tolist())
+    points = (torch.rand(500, 3, generator=generator) - 0.5) * torch.tensor([0.2, 0.2, 0.0])
+    cloud = torch.cat([points, torch.tensor([0.0, 0, 1]).expand(500, 3)], dim=1)
+    selection = Selection(distance=0.0, table=None)
+    passed = grasps[free(hand, shape, grasps, points, None, selection)]
+    best = passed[torch.argsort(passed.quality, descending=True)]
+    assert 0 < len(passed) < 200
+    assert torch.equal(select(hand, grasps, cloud, 30, selection).pose, best[:30].pose)
+    assert torch.equal(select(hand, grasps, cloud, 500, selection).pose, best.pose)
