@@ -40,7 +40,7 @@ def main(argv: list[str] | None = None) -> int:
         if rest[:1] and rest[0] in VERBS.get(command, ()):
             return int(import_module(f"dexgrasp.commands.{command}").tool(rest) or 0)
         if command in PIPELINES:
-            return pipeline(command, rest)
+            return tool(command, rest) if rest and rest[0].isidentifier() else pipeline(command, rest)
         from dexgrasp.plugins import unknown
 
         raise unknown("command", command, [*PIPELINES, *TOOLS])
@@ -50,6 +50,14 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"\ndexgrasp {command}: interrupted", file=sys.stderr)
         return 130
+
+
+def tool(command: str, arguments: list[str]) -> int:
+    """Run a pipeline's tool, e.g. ``dataset inspect <path>``: ordinary arguments, no `key=value`."""
+    run = getattr(import_module(f"dexgrasp.commands.{command}"), "tool", None)
+    if run is None:
+        raise DexgraspError(f"key=value after `{command}`", repr(arguments[0]), f"see `{command} --help`")
+    return int(run(arguments) or 0)
 
 
 def usage() -> str:

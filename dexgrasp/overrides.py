@@ -35,7 +35,7 @@ def explain(error: Exception, command: str, overrides: list[str]) -> DexgraspErr
     reason = getattr(error, "msg", None) or str(error)
     if isinstance(error.__cause__, OmegaConfBaseException):
         reason += f" ({error.__cause__.msg})"
-    lines = " ".join(reason.split())
+    lines = " ".join(reason.split("Config search path:")[0].split())
     return DexgraspError(
         f"a config that composes for `{command}`", lines, "correct the override or the YAML named there"
     )

@@ -1,0 +1,328 @@
+"""The command line: what it lists, what it accepts, how it fails, where it writes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import types
+from importlib.util import find_spec
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig, OmegaConf
+
+from dexgrasp import __main__ as cli
+from dexgrasp import config, launcher, overrides, plugins
+from dexgrasp.errors import DexgraspError
+
+CONF = config.conf_folder()
+COMMANDS = sorted(path.stem for path in CONF.glob("*.yaml") if path.stem in cli.PIPELINES)
+TRAIN = """defaults: [run, hand: barrett, part: small, _self_]
+trainer: {steps: 3, rate: 0.1}
+input: null
+needed: ???
+seed: 1
+"""
+SEEN = []
+
+
+@pytest.fixture(autouse=True)
+def quiet(monkeypatch):
+    """Hydra starts anew each time, whatever a test before has done."""
+    monkeypatch.setattr(sys, "argv", list(sys.argv))
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    monkeypatch.setattr(config.Multirun, "folder", None)
+    config.register()
+    yield
+    GlobalHydra.instance().clear()
+
+
+@pytest.fixture
+def command(monkeypatch, tmp_path, capfd):
+    """A pipeline `probe` with a config of its own; command(arguments) gives exit status, output and error output."""
+    folder = tmp_path / "conf"
+    (folder / "part").mkdir(parents=True)
+    (folder / "probe.yaml").write_text(TRAIN)
+    (folder / "run.yaml").write_text((CONF / "run.yaml").read_text())
+    for part in ("small", "large"):
+        (folder / "part" / f"{part}.yaml").write_text(f"size: {part}\n")
+    (tmp_path / "elsewhere").mkdir()
+    module = types.ModuleType("dexgrasp.commands.probe")
+    module.main = SEEN.append
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setitem(cli.PIPELINES, "probe", "for tests")
+    monkeypatch.setattr(config, "conf_folder", lambda: folder)
+    monkeypatch.setattr(overrides, "conf_folder", lambda: folder)
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    SEEN.clear()
+
+    def run(*arguments):
+        try:
+            status = cli.main(["probe", *arguments])
+        except SystemExit as error:
+            status = error.code
+        return status, *capfd.readouterr()
+
+    run.module = module
+    run.folder = tmp_path
+    return run
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"], ["help"]])
+def test_help_lists_every_command(capsys, arguments):
+    assert cli.main(arguments) == 0
+    listed = [line.split()[0] for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
+    assert listed == [*cli.PIPELINES, *cli.TOOLS]
+
+
+@pytest.mark.parametrize("name", [*cli.PIPELINES, *cli.TOOLS])
+def test_every_listed_command_is_there(name):
+    assert find_spec(f"dexgrasp.commands.{name}"), "listed, but not there"
+    if name in cli.PIPELINES:
+        assert (CONF / f"{name}.yaml").is_file()
+
+
+@pytest.mark.parametrize("name", ["trian", "evla", "dataste"])
+def test_unknown_commands_say_what_was_meant(capsys, name):
+    assert cli.main([name]) == 2
+    meant = {"trian": "train", "evla": "eval", "dataste": "dataset"}[name]
+    assert f"did you mean '{meant}'" in capsys.readouterr().err
+
+
+def test_a_run_has_the_jobs_name_and_its_folder_below_the_working_directory(command):
+    status, _, _ = command("seed=5", "part=large")
+    assert status == 0
+    assert (SEEN[0].seed, SEEN[0].part.size, SEEN[0].hand.name) == (5, "large", "barrett")
+    assert isinstance(SEEN[0], DictConfig)
+    (folder,) = (command.folder / "elsewhere/runs/probe").iterdir()
+    assert OmegaConf.load(folder / ".hydra/config.yaml").seed == 5
+
+
+def test_help_lists_every_installed_choice(command):
+    status, out, _ = command("--help")
+    assert status == 0 and "python -m dexgrasp probe" in out
+    choices = {
+        line.split(":")[0]: line.split(":")[1].replace(",", "").split() for line in out.splitlines() if ": " in line
+    }
+    for kind in plugins.GROUPS:
+        assert set(plugins.names(kind)) <= set(choices[kind])
+    assert choices["part"] == ["large", "small"]
+    assert "trainer:" in out and not SEEN
+
+
+@pytest.mark.parametrize(
+    ("wrong", "expected"),
+    [
+        (["hand=baret"], ["an installed hand: barrett", "'baret'", "did you mean 'barrett'"]),
+        (["part=smal"], ["part", "did you mean 'small'", "large, small"]),
+        (["trainer.step=3"], ["'trainer.step'", "did you mean 'trainer.steps'"]),
+        (["trainer.ratte=3"], ["did you mean 'trainer.rate'"]),
+        (["sed=3"], ["did you mean 'seed'"]),
+        (["hnd=barrett"], ["did you mean 'hand'"]),
+        (["backbone=pointnet"], ["+backbone=..."]),
+        (["x y="], ["key=value", "quote it"]),
+        (["--config-dir", "nowhere"], ["nowhere", "not found"]),
+        (["hand.urdf=${package:dexgrasp_nowhere}/a.urdf", "seed=${hand.urdf}"], ["dexgrasp_nowhere"]),
+        (["word"], ["key=value", "'word'"]),
+    ],
+)
+def test_a_wrong_command_line_is_told_in_one_message(command, wrong, expected):
+    command.module.main = lambda config: OmegaConf.to_container(config, resolve=True)
+    status, out, err = command(*wrong)
+    assert status == 2, out + err
+    for part in expected:
+        assert part in err
+    assert "Traceback" not in out + err and not SEEN
+    assert err.count("expected ") == 1 and "found" in err and "to do" in err
+
+
+def test_a_missing_value_is_named(command):
+    command.module.main = lambda config: config.needed
+    status, _, err = command()
+    assert status == 2 and "needed=..." in err and "Traceback" not in err
+
+
+def test_bad_input_within_a_command_is_one_message(command):
+    def fail(config):
+        raise DexgraspError("32 points or more", "3", "move the camera nearer")
+
+    command.module.main = fail
+    status, _, err = command()
+    assert status == 2 and "32 points or more" in err and "Traceback" not in err
+
+
+def test_a_bug_keeps_its_traceback(command):
+    command.module.main = lambda config: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        command()
+
+
+def test_ctrl_c_is_one_line_and_130(command):
+    def interrupt(config):
+        raise KeyboardInterrupt
+
+    command.module.main = interrupt
+    status, _, err = command()
+    assert status == 130 and err.strip().endswith("interrupted") and "Traceback" not in err
+
+
+def test_a_hand_in_a_plain_folder_is_a_choice(command):
+    folder = command.folder / "mine"
+    (folder / "hand").mkdir(parents=True)
+    urdf = "urdf: mine.urdf\n"
+    (folder / "hand/mine.yaml").write_text("name: mine\n" + urdf + "fingers: []\n")
+    status, _, err = command("--config-dir", str(folder), "hand=mine")
+    assert status == 2 and "mine.urdf" in err and str(folder / "hand") in err
+    (folder / "hand/mine.urdf").write_text("<robot/>")
+    status, _, err = command("--config-dir", "../mine", "hand=mine")
+    assert status == 0, err
+    assert SEEN[-1].hand.urdf == str(folder / "hand/mine.urdf")
+    status, out, _ = command("--config-dir", str(folder), "--help")
+    assert next(line for line in out.splitlines() if line.startswith("hand:")) == "hand: " + ", ".join(
+        sorted([*plugins_choices("hand"), "mine"])
+    )
+
+
+def plugins_choices(kind):
+    return {path.stem for _, folder in plugins.conf_folders() for path in (folder / kind).glob("*.yaml")}
+
+
+def test_a_glob_sweeps_every_installed_hand_and_the_runs_are_compared(command):
+    compared = []
+    command.module.compare = compared.append
+    status, _, err = command("-m", "hand=glob(*)", "seed=1,2", "hydra/launcher=basic")
+    assert status == 0, err
+    assert {seen.hand.name for seen in SEEN} == set(plugins.names("hand"))
+    assert len(SEEN) == 2 * len(plugins_choices("hand"))
+    (folder,) = (command.folder / "elsewhere/runs/probe").iterdir()
+    assert compared == [folder] and folder.name.endswith("_multirun")
+    assert {path.name for path in folder.iterdir() if path.is_dir()} == {str(i) for i in range(len(SEEN))}
+
+
+def test_a_pipelines_tool_takes_ordinary_arguments(command):
+    command.module.tool = SEEN.append
+    assert command("inspect", "some/path=odd")[0] == 0
+    assert SEEN == [["inspect", "some/path=odd"]]
+
+
+PROBE = """
+import os, sys, time
+from dexgrasp import config
+class Probe(config.Task):
+    def __call__(self, cfg):
+        assert os.environ["OMP_NUM_THREADS"]
+        print("says", cfg.seed, flush=True)
+        if cfg.seed == 7: raise ValueError("seven")
+        if cfg.seed == 8: os._exit(3)
+        if cfg.seed == 9:
+            try: time.sleep(60)
+            except KeyboardInterrupt: print("saved", flush=True); raise
+if __name__ == "__main__":
+    import probe
+    from dexgrasp import __main__ as cli, overrides
+    from pathlib import Path
+    config.Task = probe.Probe
+    config.conf_folder = overrides.conf_folder = lambda: Path(sys.argv[1])
+    cli.PIPELINES["probe"] = ""
+    sys.modules["dexgrasp.commands.probe"] = probe
+    sys.exit(cli.main(["probe", *sys.argv[2:]]))
+"""
+
+
+@pytest.fixture
+def multirun(command):
+    """Start a multirun of `probe` in a process of its own, as a shell does."""
+    (command.folder / "probe.py").write_text(PROBE)
+    environment = {**os.environ, "PYTHONPATH": str(command.folder)}
+
+    def start(*arguments):
+        words = [sys.executable, str(command.folder / "probe.py"), str(command.folder / "conf"), "-m", *arguments]
+        return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+
+    start.runs = command.folder / "elsewhere/runs/probe"
+    return start
+
+
+def outputs(runs):
+    return {path.parent.name: path.read_text() for path in runs.glob("*/*/output.txt")}
+
+
+def test_jobs_run_side_by_side_and_one_may_fail_alone(multirun):
+    out, err = (process := multirun("seed=1,7,8,2", "hydra.launcher.workers=2")).communicate(timeout=100)
+    assert process.returncode == 2, out + err
+    assert "3 failed" not in err and "2 failed" in err and "ValueError('seven')" in err and "exit status 3" in err
+    assert "Traceback" not in err
+    found = outputs(multirun.runs)
+    assert {key: text.splitlines()[0] for key, text in found.items()} == {
+        str(i): f"says {seed}" for i, seed in enumerate((1, 7, 8, 2))
+    }
+    assert "ValueError: seven" in found["1"], "the whole traceback is in the job's output"
+    assert not list(multirun.runs.rglob("*.pickle"))
+
+
+def test_ctrl_c_reaches_the_jobs_once(multirun):
+    process = multirun("seed=9,9,1", "hydra.launcher.workers=2")
+    until = time.monotonic() + 60
+    while sum("says" in text for text in outputs(multirun.runs).values()) < 2 and time.monotonic() < until:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and "interrupted" in err and "Traceback" not in err
+    assert [text.count("saved") for text in outputs(multirun.runs).values()] == [1, 1], "and the third never began"
+
+
+def test_submitit_runs_the_same_jobs(multirun):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    _, err = (process := multirun("seed=1,2", "hydra/launcher=submitit_local")).communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert len(list(multirun.runs.glob("*/[01]/.hydra/config.yaml"))) == 2
+
+
+def test_threads_are_divided_among_the_jobs(tmp_path):
+    assert launcher.LocalLauncher(3).workers == 3
+    assert launcher.LocalLauncher().workers == max(1, (os.cpu_count() or 1) // 2)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_config_of_every_command_composes(name):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        whole = compose(name, return_hydra_config=True)
+        assert whole.hydra.run.dir.startswith("runs/"), "a run's folder lies below the working directory"
+        OmegaConf.resolve(compose(name))
+
+
+def choices(name):
+    """(command, group=choice) for every YAML of every group that a command's config uses."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        try:
+            used = compose(name, return_hydra_config=True).hydra.runtime.choices
+        except Exception as error:
+            return [pytest.param(name, str(error), id=f"{name}-broken")]
+        loader = GlobalHydra.instance().hydra.config_loader
+        groups = [str(group) for group in used if not str(group).startswith("hydra/") and used[group] is not None]
+        groups += ["experiment"] if "experiment" in used or "experiment" in loader.list_groups("") else []
+        found = [f"{g}={choice}" for g in sorted(set(groups)) for choice in loader.get_group_options(g.split("@")[0])]
+        optional = set(groups) - set(map(str, used))
+    return [
+        pytest.param(name, f"+{text}" if text.split("=")[0] in optional else text, id=f"{name}-{text}")
+        for text in found
+    ]
+
+
+config.register()
+CHOICES = [case for name in COMMANDS for case in choices(name)]
+
+
+@pytest.mark.parametrize(("name", "choice"), CHOICES)
+def test_every_choice_of_every_command_composes(name, choice):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        OmegaConf.to_container(compose(name, [choice]), resolve=True)
+
+
+def test_every_config_is_used():
+    """No YAML that no command can reach."""
+    reached = {case.values[1].lstrip("+").split("@")[0].split("=")[0] for case in CHOICES}
+    groups = {path.parent.relative_to(CONF).as_posix() for path in CONF.glob("*/**/*.yaml")}
+    assert not groups - reached, "groups that no command uses"
