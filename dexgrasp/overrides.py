@@ -20,7 +20,7 @@ def explain(error: Exception, command: str, overrides: list[str]) -> DexgraspErr
     while cause is not None:  # ours, raised inside a resolver or an instantiation
         if isinstance(cause, DexgraspError):
             return cause
-        cause = cause.__cause__
+        cause = cause.__cause__ or cause.__context__
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         return unknown(group or "config", name.removesuffix(".yaml"), sorted(error.options))

@@ -11,6 +11,7 @@ from importlib.util import find_spec
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from dexgrasp import __main__ as cli
@@ -224,7 +225,8 @@ if __name__ == "__main__":
     from dexgrasp import __main__ as cli, overrides
     from pathlib import Path
     config.Task = probe.Probe
-    config.conf_folder = overrides.conf_folder = lambda: Path(sys.argv[1])
+    folder = Path(sys.argv[1])
+    config.conf_folder = overrides.conf_folder = lambda: folder
     cli.PIPELINES["probe"] = ""
     sys.modules["dexgrasp.commands.probe"] = probe
     sys.exit(cli.main(["probe", *sys.argv[2:]]))
@@ -298,8 +300,8 @@ def choices(name):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         try:
             used = compose(name, return_hydra_config=True).hydra.runtime.choices
-        except Exception as error:
-            return [pytest.param(name, str(error), id=f"{name}-broken")]
+        except HydraException:
+            return []  # the test above says it
         loader = GlobalHydra.instance().hydra.config_loader
         groups = [str(group) for group in used if not str(group).startswith("hydra/") and used[group] is not None]
         groups += ["experiment"] if "experiment" in used or "experiment" in loader.list_groups("") else []
