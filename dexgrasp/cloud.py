@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dexgrasp.errors import DexgraspError
@@ -12,7 +12,9 @@ FEWEST = 32
 FARTHEST = 20.0
 """Median distance from the camera (m) beyond which a cloud is taken to be in millimetres."""
 DENSE = 4
-"""Normals of very dense clouds are estimated on this many times the network's points."""
+"""Normals of very dense clouds are estimated from this many times the network's points, ..."""
+NEIGHBOURS = 120
+"""... and this many of each point's neighbours."""
 
 Array = Float[np.ndarray, "P 3"] | Float[Tensor, "P 3"]
 
@@ -20,8 +22,8 @@ Array = Float[np.ndarray, "P 3"] | Float[Tensor, "P 3"]
 def prepare(points: Array, normals: Array | None, count: int, seed: int) -> Float[Tensor, "N 6"]:
     """Return positions (m) and unit normals towards the camera of at most `count` points, float32, on the CPU.
 
-    Points are in the camera frame. Larger clouds are thinned at random, the same for the same seed. Raises
-    `DexgraspError` for anything that is not a cloud in metres.
+    Points are in the camera frame. Larger clouds are thinned at random, the dominant plane more than the rest; the
+    same for the same seed. Raises `DexgraspError` for anything that is not a cloud in metres.
     """
     xyz = _checked("points", points)
     if len(xyz) < FEWEST:
@@ -33,29 +35,37 @@ def prepare(points: Array, normals: Array | None, count: int, seed: int) -> Floa
             f"a median distance of {distance:.4g} from the camera, which looks like millimetres",
             "divide the points by 1000",
         )
-    if normals is None:
+    directions = None if normals is None else _unit(xyz, _checked("normals", normals))
+    if directions is None and len(xyz) > DENSE * count:
+        xyz = xyz[_thin(xyz, DENSE * count, seed)]
+    chosen = _thin(xyz, count, seed)
+    if directions is None:
         from dexgrasp.dataset.normals import estimate_normals
 
-        xyz = xyz[_thin(len(xyz), DENSE * count, seed)]
-        directions = estimate_normals(xyz)
+        directions = estimate_normals(xyz, k=NEIGHBOURS, at=chosen.numpy())
     else:
-        directions = _checked("normals", normals)
-        if directions.shape != xyz.shape:
-            raise DexgraspError(f"one normal per point, {tuple(xyz.shape)}", f"{tuple(directions.shape)}", "match them")
-        length = torch.linalg.vector_norm(directions, dim=1, keepdim=True)
-        if (length == 0).any():
-            raise DexgraspError("normals of non-zero length", f"{int((length == 0).sum())} zeros", "leave normals out")
-        directions = directions / length
-        towards = -(directions * xyz).sum(1, keepdim=True)
-        directions = torch.where(towards < 0, -directions, directions)
-    cloud = torch.cat([xyz, directions], dim=1).float()
-    return cloud[_thin(len(cloud), count, seed)]
+        directions = directions[chosen]
+    return torch.cat([xyz[chosen], directions], dim=1).float()
 
 
-def _thin(total: int, count: int, seed: int) -> Tensor:
-    if total <= count:
-        return torch.arange(total)
-    return torch.from_numpy(np.sort(stream(seed, "thin", total).permutation(total)[:count]))
+def _thin(xyz: Float[Tensor, "P 3"], count: int, seed: int) -> Int[Tensor, "N"]:
+    """Choose points as the training data's clouds are chosen: a large table does not crowd out what stands on it."""
+    if len(xyz) <= count:
+        return torch.arange(len(xyz))
+    from dexgrasp.dataset.sensor import Framing, downsample
+
+    return torch.from_numpy(downsample(xyz.numpy(), Framing(points=count), stream(seed, "thin", count)))
+
+
+def _unit(xyz: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+    """Return unit normals on the camera's side."""
+    if normals.shape != xyz.shape:
+        raise DexgraspError(f"one normal per point, {tuple(xyz.shape)}", f"{tuple(normals.shape)}", "match them")
+    length = torch.linalg.vector_norm(normals, dim=1, keepdim=True)
+    if (length == 0).any():
+        raise DexgraspError("normals of non-zero length", f"{int((length == 0).sum())} zeros", "leave normals out")
+    unit = normals / length
+    return torch.where((unit * xyz).sum(1, keepdim=True) > 0, -unit, unit)
 
 
 def _checked(name: str, values: Array) -> Float[Tensor, "P 3"]:

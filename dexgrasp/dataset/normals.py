@@ -25,22 +25,25 @@ def estimate_normals(
     viewpoint: tuple[float, float, float] = (0.0, 0.0, 0.0),
     k: int = 40,
     radius: float = RADIUS,
+    at: Int[np.ndarray, "M"] | None = None,
 ) -> Float[Tensor, "N 3"]:
     """Return unit normals towards `viewpoint` from the `k` nearest points within `radius`, or the `FEWEST` nearest.
 
     Positions, radius and viewpoint are in metres and in one frame; the order of points does not matter. Estimate
-    before thinning a cloud: the denser it is, the better the normals.
+    before thinning a cloud: the denser it is, the better the normals. With `at`, only those rows' normals, (M, 3),
+    still from all points.
     """
     cloud = points.detach().cpu().double().numpy()
     eye = np.asarray(viewpoint, dtype=np.float64)
     if len(cloud) == 0:
         return torch.zeros_like(points)
     k = max(min(k, len(cloud)), 2)
-    distances, neighbours = cKDTree(cloud).query(cloud, k=k)
+    rows = np.arange(len(cloud)) if at is None else np.asarray(at, dtype=np.int64)
+    distances, neighbours = cKDTree(cloud).query(cloud[rows], k=k)
     far = distances > radius
     far[:, :FEWEST] = False
     neighbours[far] = len(cloud)
-    return torch.from_numpy(_fit_neighbours(cloud, neighbours, eye)).to(points)
+    return torch.from_numpy(_fit_neighbours(cloud, rows, neighbours, eye)).to(points)
 
 
 def depth_normals(
@@ -60,17 +63,18 @@ def depth_normals(
 
 
 @numba.njit(cache=True)
-def _fit_neighbours(cloud: NDArray, neighbours: NDArray, eye: NDArray) -> NDArray:
-    normals = np.empty_like(cloud)
+def _fit_neighbours(cloud: NDArray, rows: NDArray, neighbours: NDArray, eye: NDArray) -> NDArray:
+    normals = np.empty((len(rows), 3))
     sums = np.empty(9)
-    for i in range(len(cloud)):
+    for m in range(len(rows)):
+        i = rows[m]
         sums[:] = 0.0
         count = 0
-        for j in neighbours[i]:
+        for j in neighbours[m]:
             if j < len(cloud):
                 _add(sums, cloud[j, 0] - cloud[i, 0], cloud[j, 1] - cloud[i, 1], cloud[j, 2] - cloud[i, 2])
                 count += 1
-        _plane(sums, count, eye[0] - cloud[i, 0], eye[1] - cloud[i, 1], eye[2] - cloud[i, 2], normals[i])
+        _plane(sums, count, eye[0] - cloud[i, 0], eye[1] - cloud[i, 1], eye[2] - cloud[i, 2], normals[m])
     return normals
 
 
