@@ -12,14 +12,13 @@ PIPELINES = {
     "eval": "run a trained network (or the labels) in physics",
     "predict": "grasps for one point cloud or depth image",
     "fidelity": "how much of a grasp each representation keeps",
-    "benchmark": "speed of every stage",
 }
 """Hydra apps: ``key=value`` overrides; config ``conf/<command>.yaml``."""
 
 TOOLS = {
     "plugins": "list installed hands, representations and backbones",
     "hand": "try the laws on a hand: hand check <name>",
-    "report": "write the report of a run again",
+    "report": "write the report of an evaluation again: report <folder>",
 }
 """Ordinary arguments."""
 
