@@ -14,6 +14,7 @@ from torch import Tensor
 from dexgrasp.batch import Batch
 from dexgrasp.grasps import Grasps
 from dexgrasp.representation import Representation, Targets
+from dexgrasp.sampling import farthest_points
 from dexgrasp.scene import View
 
 Check = Callable[[Grasps, Grasps], tuple[Bool[Tensor, "N"], Float[Tensor, "N"]]]
@@ -30,42 +31,48 @@ class LabelSettings:
     """Most that the contact's normal may differ from the point's estimated one, rad."""
     tries: int = 12
     """Pairs of grasp and finger tried at each point, best quality first."""
+    points: int | None = 2048
+    """Only so many points of a view are labelled: the farthest-point samples, among which backbones choose their seeds
+    in the same order; None: all."""
 
 
 @dataclass(frozen=True)
 class Labels(Batch):
-    """The points of a view that lie near a contact; all others are not graspable."""
+    """What is known of K points of a view."""
 
     point: Int[Tensor, "K"]
     """Index in the view, ascending."""
     finger: Int[Tensor, "K"]
-    """1..F: the finger that touches here."""
+    """0: no contact is near; 1..F: the finger that touches here."""
     parameters: Float[Tensor, "K P"]
     """The grasp in the representation's numbers."""
     quality: Float[Tensor, "K"]
     """Of the grasp that is told here; 0 where none is true."""
     true: Bool[Tensor, "K"]
-    """False: no grasp that touches near here could be told from here."""
+    """Whether a grasp that touches near here was told from here and still is one; False where `finger` is 0."""
     grasp: Int[Tensor, "K"]
-    """Index of the grasp among those that were given."""
+    """Index of the grasp among those that were given; -1 where `finger` is 0."""
 
     def targets(self, count: int, *, failed: str = "negative") -> Targets:
         """Return the targets of all `count` points of the view.
 
         ``failed="negative"`` makes points whose grasps cannot be told from there not graspable; ``"ignored"`` leaves
-        them out of the loss.
+        them out of the loss, as points of which nothing is known always are (`finger` 1, not encodable).
         """
         if failed not in ("negative", "ignored"):
             raise ValueError(f"failed: expected 'negative' or 'ignored', found {failed!r}")
-        kept = self if failed == "ignored" else self[self.true]
-        finger = torch.zeros(count, dtype=torch.long)
-        parameters = self.parameters.new_zeros(count, self.parameters.shape[1])
-        quality = self.quality.new_zeros(count)
-        encodable = torch.ones(count, dtype=torch.bool)
-        where = kept.point.long()
-        finger[where], parameters[where] = kept.finger.long(), kept.parameters
-        quality[where], encodable[where] = kept.quality, kept.true
-        return Targets(finger, parameters, quality, encodable)
+        where, finger = self.point.long(), self.finger.long()
+        if failed == "negative":
+            finger = torch.where(self.true, finger, 0)
+        targets = Targets(
+            finger=torch.ones(count, dtype=torch.long),
+            parameters=self.parameters.new_zeros(count, self.parameters.shape[1]),
+            quality=self.quality.new_zeros(count),
+            encodable=torch.zeros(count, dtype=torch.bool),
+        )
+        targets.finger[where], targets.parameters[where] = finger, self.parameters
+        targets.quality[where], targets.encodable[where] = self.quality, self.true | (finger == 0)
+        return targets
 
 
 @torch.no_grad()
@@ -83,35 +90,41 @@ def label(
     """
     settings = settings or LabelSettings()
     fingers = grasps.contacts.shape[1]
-    point, contact = near_pairs(view, grasps, settings)
-    best_first = np.lexsort((contact, -grasps.quality.numpy()[contact // fingers], point))
-    contact = torch.from_numpy(contact[best_first])
-    runs = np.unique(point[best_first], return_index=True, return_counts=True)
-    points, start, size = (torch.from_numpy(part) for part in runs)
-
+    chosen = torch.arange(len(view))
+    if settings.points is not None and settings.points < len(view):
+        chosen = farthest_points(view.points, settings.points).sort().values
+    asked = View(view.points[chosen], view.normals[chosen], view.instance[chosen], view.world_T_camera)
+    point, touched = near_pairs(asked, grasps, settings)
+    best_first = np.lexsort((touched, -grasps.quality.numpy()[touched // fingers], point))
+    contact = torch.from_numpy(touched[best_first])
+    size = torch.from_numpy(np.bincount(point, minlength=len(asked)))
+    start = size.cumsum(0) - size
     found = Labels(
-        point=points,
-        finger=contact[start] % fingers + 1,
-        parameters=view.points.new_zeros(len(points), representation.size),
-        quality=view.points.new_zeros(len(points)),
-        true=torch.zeros(len(points), dtype=torch.bool),
-        grasp=contact[start] // fingers,
+        point=chosen.int(),
+        finger=torch.zeros(len(asked), dtype=torch.int8),
+        parameters=view.points.new_zeros(len(asked), representation.size),
+        quality=view.points.new_zeros(len(asked)),
+        true=torch.zeros(len(asked), dtype=torch.bool),
+        grasp=torch.full((len(asked),), -1, dtype=torch.int32),
     )
+    near = size > 0
+    found.finger[near] = (contact[start[near]] % fingers + 1).to(torch.int8)
+    found.grasp[near] = (contact[start[near]] // fingers).int()
     for turn in range(settings.tries):
         row = (~found.true & (turn < size)).nonzero().flatten()
         if not len(row):
             break
         pair = contact[start[row] + turn]
         original = grasps[pair // fingers].replace(finger=pair % fingers)
-        at, normals = view.points[points[row]], view.normals[points[row]]
+        at, normals = asked.points[row], asked.normals[row]
         targets = representation.encode(at, normals, original)
         told = representation.decode(at, normals, representation.as_prediction(targets))
         true, quality = torch.zeros(len(row), dtype=torch.bool), torch.zeros_like(targets.quality)
         can = targets.encodable
         true[can], quality[can] = check(told[can], original[can])
         row, targets, pair, quality = row[true], targets[true], pair[true], quality[true]
-        found.finger[row], found.parameters[row], found.quality[row] = targets.finger, targets.parameters, quality
-        found.true[row], found.grasp[row] = True, pair // fingers
+        found.finger[row], found.grasp[row] = targets.finger.to(torch.int8), (pair // fingers).int()
+        found.parameters[row], found.quality[row], found.true[row] = targets.parameters, quality, True
     return found
 
 
