@@ -64,8 +64,7 @@ def ensure(
         parent = digest(content)
         folder = root / f"{stage}-{parent}"
         dataset = Dataset(settings, hand, folders, told)
-        inputs, make, per_shard = _work(stage, dataset)
-        _run(folder, stage, content, inputs, make, per_shard, settings)
+        _run(folder, stage, content, *_work(stage, dataset), settings)
         folders[stage] = folder
     return Dataset(settings, hand, folders, told)
 
@@ -126,19 +125,19 @@ def _listing(objects: dict[str, Any]) -> list[Any]:
     return [[str(path.relative_to(folder)), path.stat().st_size] for path in files]
 
 
-def _work(stage: str, dataset: Dataset) -> tuple[Callable[[], Sequence[Any]], Callable[..., Item], int]:
-    """Return what a stage is made of: its inputs (when asked for), what makes one of them, and items per shard."""
+def _work(stage: str, dataset: Dataset) -> tuple[Callable[[], Sequence[Any]], Callable[..., Item]]:
+    """Return what a stage is made of, when asked for, and what makes one item of it."""
     config = dataset.config
     if stage == "objects":
-        return lambda: _objects(config), stages.make_object, 64
+        return lambda: _objects(config), stages.make_object
     if stage == "grasps":
-        return lambda: range(len(dataset.store("objects"))), partial(stages.make_grasps, dataset), 2
+        return lambda: range(len(dataset.store("objects"))), partial(stages.make_grasps, dataset)
     if stage == "scenes":
-        return lambda: range(config["scenes"]["count"]), partial(stages.make_scene, dataset), 16
+        return lambda: range(config["scenes"]["count"]), partial(stages.make_scene, dataset)
     if stage == "views":
         number = config["scenes"]["count"] * config["views"]["per_scene"]
-        return lambda: range(number), partial(stages.make_view, dataset), 16
-    return lambda: range(len(dataset)), partial(stages.make_labels, dataset), 16
+        return lambda: range(number), partial(stages.make_view, dataset)
+    return lambda: range(len(dataset)), partial(stages.make_labels, dataset)
 
 
 def _objects(config: Mapping[str, Any]) -> list[tuple[int, Any]]:
@@ -157,7 +156,6 @@ def _run(
     content: Mapping[str, Any],
     inputs: Callable[[], Sequence[Any]],
     make: Callable[..., Item],
-    per_shard: int,
     settings: Mapping[str, Any],
 ) -> None:
     if _finished(folder):
@@ -166,6 +164,8 @@ def _run(
         if _finished(folder):
             return
         work = inputs()
+        # Small enough to keep every worker busy, large enough not to litter; the same for any number of workers.
+        per_shard = min(max(math.ceil(len(work) / 32), 1), 16)
         count = math.ceil(len(work) / per_shard)
         store = Store.create(folder, stage, content, settings["seed"], count)
         log.info("making %s in %s: %d of %d shards are missing", stage, folder, len(store.missing), count)
