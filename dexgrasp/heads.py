@@ -10,6 +10,7 @@ from torch.nn import functional as F
 from dexgrasp.errors import DexgraspError
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
+from dexgrasp.representation import Targets
 
 CERTAIN = 100.0
 """Logit of the true class in `as_prediction`: its probability is 1 in float32."""
@@ -113,7 +114,7 @@ class JointBins(nn.Module):
         index, residual = self.split(angles, joint)
         bins = F.cross_entropy(self._masked(logits, joint).flatten(0, 1), index.flatten(), reduction="none")
         told = residuals.gather(-1, index.unsqueeze(-1)).squeeze(-1)
-        rest = F.smooth_l1_loss(told, residual.to(told), reduction="none", beta=huber)
+        rest = F.smooth_l1_loss(told.to(residual), residual, reduction="none", beta=huber)
         return (bins.view_as(rest) + rest) * (self.count[joint] > 0)
 
     def as_prediction(
@@ -167,6 +168,16 @@ def told_grasps(
     )
 
 
-def masked_mean(values: Float[Tensor, "N *r"], mask: Tensor) -> Tensor:
-    """Return the mean over the points of `mask`, summed over the other axes; 0 (with gradient) where it is empty."""
-    return values[mask].sum() / mask.sum().clamp(min=1)
+def known_points(targets: Targets) -> Int[Tensor, "K"]:
+    """Return the rows that the finger's loss counts: all but grasps that cannot be told."""
+    return ((targets.finger == 0) | targets.encodable).nonzero().flatten()
+
+
+def contact_points(targets: Targets) -> Int[Tensor, "K"]:
+    """Return the rows that all other losses count: grasps that can be told."""
+    return ((targets.finger > 0) & targets.encodable).nonzero().flatten()
+
+
+def mean(losses: Float[Tensor, "K *r"]) -> Tensor:
+    """Return the mean over points of the sum over all else; 0, with a gradient of 0, for no point."""
+    return losses.sum() / max(1, len(losses))

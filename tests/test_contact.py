@@ -325,6 +325,18 @@ def test_untrained_predictions_are_grasps_within_the_limits(contact, toy_hand):
     assert ((grasps.quality >= 0) & (grasps.quality <= 1)).all()
 
 
+def test_bfloat16_outputs_are_decoded_and_lose_in_full_precision(contact, toy_hand):
+    targets = some_targets(contact, toy_hand)
+    coarse = {name: value.bfloat16() for name, value in contact(features(63)).items()}
+    points, normals = unit(63, 34, torch.float32), unit(63, 35, torch.float32)
+    grasps = contact.decode(points, normals, coarse)
+    assert {grasps.pose.dtype, grasps.joints.dtype, grasps.quality.dtype} == {torch.float32}
+    torch.testing.assert_close(toy_hand.clamp(grasps.joints), grasps.joints, atol=1e-6, rtol=0)
+    fine = contact.loss({name: value.float() for name, value in coarse.items()}, targets)
+    for name, term in contact.loss(coarse, targets).items():
+        torch.testing.assert_close(term.float(), fine[name], atol=0.02, rtol=0.02)
+
+
 def test_no_point_is_no_grasp(contact, toy_hand):
     nothing = torch.zeros(0, 3)
     grasps = contact.decode(nothing, nothing, contact(torch.zeros(0, 32)))

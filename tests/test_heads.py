@@ -6,7 +6,18 @@ import pytest
 import torch
 
 from dexgrasp.errors import DexgraspError
-from dexgrasp.heads import Heads, JointBins, finger_loss, masked_mean, mlp, shared_joints, told_grasps
+from dexgrasp.heads import (
+    Heads,
+    JointBins,
+    contact_points,
+    finger_loss,
+    known_points,
+    mean,
+    mlp,
+    shared_joints,
+    told_grasps,
+)
+from dexgrasp.representation import Targets
 
 
 @pytest.fixture(scope="module")
@@ -145,12 +156,19 @@ def test_focal_loss_of_certainty_has_finite_gradient():
     assert torch.isfinite(logits.grad).all()
 
 
-def test_masked_mean_of_nothing_is_zero_with_gradient():
+def test_mean_over_no_point_is_zero_with_gradient():
     values = torch.ones(4, 3, requires_grad=True)
-    mean = masked_mean(values, torch.zeros(4, dtype=torch.bool))
-    mean.backward()
-    assert mean == 0 and values.grad.abs().sum() == 0
-    assert masked_mean(values, torch.tensor([True, False, True, False])) == 3
+    nothing = mean(values[:0])
+    nothing.backward()
+    assert nothing == 0 and values.grad.abs().sum() == 0
+    assert mean(values[:2]) == 3
+
+
+def test_rows_that_losses_count():
+    finger, encodable = torch.tensor([0, 0, 1, 2]), torch.tensor([True, False, True, False])
+    targets = Targets(finger, torch.zeros(4, 6), torch.zeros(4), encodable)
+    assert known_points(targets).tolist() == [0, 1, 2]
+    assert contact_points(targets).tolist() == [2]
 
 
 def test_told_grasps_touch_with_their_finger_only(toy_hand):

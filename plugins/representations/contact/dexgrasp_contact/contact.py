@@ -10,7 +10,17 @@ from torch.nn import functional as F
 from dexgrasp.contact_frame import place, project
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
-from dexgrasp.heads import CERTAIN, Heads, JointBins, finger_loss, masked_mean, shared_joints, told_grasps
+from dexgrasp.heads import (
+    CERTAIN,
+    Heads,
+    JointBins,
+    contact_points,
+    finger_loss,
+    known_points,
+    mean,
+    shared_joints,
+    told_grasps,
+)
 from dexgrasp.representation import Prediction, Representation, Targets
 
 
@@ -107,15 +117,16 @@ class Contact(Representation):
 
     def decode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], prediction: Prediction) -> Grasps:
         """Return one grasp per point; (x, y) outside the unit disc is projected onto it."""
+        prediction = {name: value.to(points) for name, value in prediction.items()}
         probability = prediction["finger"].softmax(-1)
         finger = prediction["finger"][:, 1:].argmax(-1)
         joint = self.order[finger]
         slots = self.joints.lower[joint].to(points)
         told = self.main_slots + self.supporting_slots
         logits, residuals = self._joint_outputs(prediction)
-        slots[:, told] = self.joints.join(logits, residuals, joint[:, told]).to(points)
+        slots[:, told] = self.joints.join(logits, residuals, joint[:, told])
         joints = torch.empty_like(slots).scatter(-1, joint, slots)
-        base = place(self.hand, finger, points, normals, prediction["xy"].to(points), joints)
+        base = place(self.hand, finger, points, normals, prediction["xy"], joints)
         return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0])
 
     def forward(self, features: Float[Tensor, "N C"]) -> Prediction:
@@ -132,24 +143,19 @@ class Contact(Representation):
 
         Points that are graspable but not encodable count nowhere; all terms but the first count contact points only.
         """
-        known = (targets.finger == 0) | targets.encodable
-        contact = (targets.finger > 0) & targets.encodable
+        known, contact = known_points(targets), contact_points(targets)
         classes = finger_loss(
             prediction["finger"][known], targets.finger[known], none_weight=self.none_weight, focal=self.focal
         )
-        finger = (targets.finger - 1).clamp(min=0)
-        xy = targets.parameters[:, :2].to(prediction["xy"])
-        terms = {
-            "finger": self.alpha * classes,
-            "projection": self.beta * masked_mean((prediction["xy"] - xy).norm(dim=-1), contact),
-        }
+        truth, finger = targets.parameters[contact], targets.finger[contact] - 1
         told = self.main_slots + self.supporting_slots
         joint, kind = self.order[finger][:, told], self.kind[finger][:, told]
-        logits, residuals = self._joint_outputs(prediction)
-        slots = targets.parameters[:, 2:][:, told]
-        losses = self.joints.loss(logits, residuals, slots, joint, huber=self.huber)
+        logits, residuals = self._joint_outputs({name: value[contact] for name, value in prediction.items()})
+        joints = self.joints.loss(logits, residuals, truth[:, 2:][:, told], joint, huber=self.huber)
+        projection = torch.linalg.vector_norm(prediction["xy"][contact].to(truth) - truth[:, :2], dim=-1)
+        terms = {"finger": self.alpha * classes, "projection": self.beta * mean(projection)}
         for index, (name, weight) in enumerate(self.gammas.items()):
-            terms[name] = self.gamma * weight * masked_mean(losses * (kind == index), contact)
+            terms[name] = self.gamma * weight * mean(joints * (kind == index))
         return terms
 
     def as_prediction(self, targets: Targets) -> Prediction:

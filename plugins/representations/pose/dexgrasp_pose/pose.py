@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from dexgrasp import geometry
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
-from dexgrasp.heads import CERTAIN, Heads, JointBins, finger_loss, masked_mean, told_grasps
+from dexgrasp.heads import CERTAIN, Heads, JointBins, contact_points, finger_loss, known_points, mean, told_grasps
 from dexgrasp.representation import Prediction, Representation, Targets
 
 
@@ -80,14 +80,15 @@ class Pose(Representation):
 
     def decode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], prediction: Prediction) -> Grasps:
         """Return one grasp per point."""
+        prediction = {name: value.to(points) for name, value in prediction.items()}
         probability = prediction["finger"].softmax(-1)
         finger = prediction["finger"][:, 1:].argmax(-1)
-        joint = torch.arange(len(self.hand.joint_names), device=points.device).expand(len(points), -1)
+        joint = torch.tensor(self.told, device=points.device).expand(len(points), -1)
         joints = self.joints.lower.to(points).repeat(len(points), 1)
         logits, residuals = prediction["joints"].unbind(-2)
-        joints[:, self.told] = self.joints.join(logits, residuals, joint[:, self.told]).to(points)
-        rotation = _orthonormal(prediction["rotation"].to(points))
-        base = geometry.pose(rotation, points + self.scale * prediction["offset"].to(points))
+        joints[:, self.told] = self.joints.join(logits, residuals, joint)
+        rotation = _orthonormal(prediction["rotation"])
+        base = geometry.pose(rotation, points + self.scale * prediction["offset"])
         return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0])
 
     def forward(self, features: Float[Tensor, "N C"]) -> Prediction:
@@ -98,29 +99,26 @@ class Pose(Representation):
 
     def loss(self, prediction: Prediction, targets: Targets) -> dict[str, Tensor]:
         """Return the terms finger, offset, rotation and joints; all but the first count contact points only."""
-        known = (targets.finger == 0) | targets.encodable
-        contact = (targets.finger > 0) & targets.encodable
+        known, contact = known_points(targets), contact_points(targets)
         classes = finger_loss(
             prediction["finger"][known], targets.finger[known], none_weight=self.none_weight, focal=self.focal
         )
-        truth = targets.parameters.to(prediction["offset"])
-        joint = torch.arange(len(self.hand.joint_names), device=truth.device)[self.told].expand(len(truth), -1)
-        logits, residuals = prediction["joints"].unbind(-2)
-        angles = targets.parameters[:, 9:][:, self.told]
-        joints = self.joints.loss(logits, residuals, angles, joint, huber=self.huber)
-        offset = (prediction["offset"] - truth[:, :3]).norm(dim=-1)
-        rotation = (prediction["rotation"] - truth[:, 3:9]).norm(dim=-1)
+        truth = targets.parameters[contact]
+        joint = torch.tensor(self.told, device=truth.device).expand(len(truth), -1)
+        logits, residuals = prediction["joints"][contact].unbind(-2)
+        joints = self.joints.loss(logits, residuals, truth[:, 9:][:, self.told], joint, huber=self.huber)
+        offset = torch.linalg.vector_norm(prediction["offset"][contact].to(truth) - truth[:, :3], dim=-1)
+        rotation = torch.linalg.vector_norm(prediction["rotation"][contact].to(truth) - truth[:, 3:9], dim=-1)
         return {
             "finger": self.alpha * classes,
-            "offset": self.beta_offset * masked_mean(offset, contact),
-            "rotation": self.beta_rotation * masked_mean(rotation, contact),
-            "joints": self.gamma * masked_mean(joints, contact),
+            "offset": self.beta_offset * mean(offset),
+            "rotation": self.beta_rotation * mean(rotation),
+            "joints": self.gamma * mean(joints),
         }
 
     def as_prediction(self, targets: Targets) -> Prediction:
         """Return what a perfect network would put out."""
-        joint = torch.arange(len(self.hand.joint_names), device=targets.finger.device)
-        joint = joint[self.told].expand(len(targets), -1)
+        joint = torch.tensor(self.told, device=targets.finger.device).expand(len(targets), -1)
         angles = targets.parameters[:, 9:][:, self.told]
         return {
             "finger": CERTAIN * F.one_hot(targets.finger, len(self.hand.fingers) + 1).to(targets.parameters),
