@@ -24,9 +24,12 @@ class Selection:
     """Grasps that score less are never offered."""
     candidates: int = 1024
     """Only so many of the best are looked at."""
-    depth: float | None = 0.004
-    """How deep an observed point may lie in the open hand; None: the cloud is not looked at."""
-    table: float | None = 0.002
+    depth: float | None = 0.003
+    """How deep an observed point may lie in the open hand; None: the cloud is not looked at.
+
+    On 8 scenes of five shapes seen by a noisy D435: 100 % of the feasible grasps pass at 2 to 10 mm, and 3 % of the
+    infeasible ones at 3 mm (11 % at 10 mm); most of these meet what the camera does not see."""
+    table: float | None = 0.001
     """How far the hand may reach below the table that is found in the cloud; None: no table is looked for."""
     retreat: float = 0.10
     """Length of the straight approach that must be free."""

@@ -45,11 +45,27 @@ def find_table(
     best = int(support.argmax())
     if support[best] < share:
         return None
-    inliers = points[on[:, best]]
-    centre = inliers.mean(0)
-    up = torch.linalg.svd(inliers - centre, full_matrices=False).Vh[2]
-    up = up if up @ centre < 0 else -up
-    return _frame(up, centre)
+    return _refined(rows, normal[best], offset[best], tolerance)
+
+
+def _refined(
+    rows: Float[Tensor, "N 6"], up: Float[Tensor, "3"], offset: Tensor, tolerance: float, rounds: int = 4
+) -> Float[Tensor, "4 4"]:
+    """Fit the plane to all points near it, in a band that narrows down to the noise: feet of objects tilt it."""
+    points, normals = rows.split(3, dim=1)
+    band = tolerance
+    for _ in range(rounds):
+        height = points @ up + offset
+        near = points[(height.abs() < band) & (normals @ up > 0.9)]
+        if len(near) < 3:
+            break
+        centre = near.mean(0)
+        axis = torch.linalg.svd(near - centre, full_matrices=False).Vh[2]
+        up = axis if axis @ up > 0 else -axis
+        offset = -(up @ centre)
+        spread = (near @ up + offset).abs().median()
+        band = min(tolerance, max(0.002, 3 * float(spread)))
+    return _frame(up, -offset * up)
 
 
 def _frame(up: Float[Tensor, "3"], origin: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:

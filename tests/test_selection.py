@@ -54,7 +54,7 @@ def test_free_of_the_table(hand, shape):
     lowest = float(shape.table_distance(above(hand, [0.0]).pose, above(hand, [0.0]).joints))
     opened = pregrasp(hand, above(hand, [0.0]), 0.0)[1]
     lowest = min(lowest, float(shape.table_distance(above(hand, [0.0]).pose, opened)))
-    grasps = above(hand, [-lowest + 0.003, -lowest - 0.001, -lowest - 0.003])
+    grasps = above(hand, [-lowest + 0.003, -lowest - 0.0005, -lowest - 0.002])
     assert free(hand, shape, grasps, FAR, table, Selection()).tolist() == [True, True, False]
     assert free(hand, shape, grasps, FAR, None, Selection()).all()
 
