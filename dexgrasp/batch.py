@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+
+B = TypeVar("B", bound="Batch")  # not Self: beartype, under pytest, takes that in decorated classes only
 
 
 @dataclass(frozen=True)
@@ -27,21 +29,21 @@ class Batch:
     def __len__(self) -> int:
         return len(next(iter(self.tensors().values())))
 
-    def __getitem__(self, index: Any) -> Self:
+    def __getitem__(self: B, index: Any) -> B:
         if isinstance(index, int):
             index = slice(index, index + 1) if index != -1 else slice(index, None)
         return type(self)(**{name: value[index] for name, value in self.tensors().items()})
 
-    def to(self, *args: Any, **kwargs: Any) -> Self:
+    def to(self: B, *args: Any, **kwargs: Any) -> B:
         """Move every field, as `torch.Tensor.to`; a dtype applies to floating-point fields only."""
         return type(self)(**{name: _to(value, *args, **kwargs) for name, value in self.tensors().items()})
 
-    def replace(self, **changes: Tensor) -> Self:
+    def replace(self: B, **changes: Tensor) -> B:
         """Return a copy with some fields exchanged."""
         return replace(self, **changes)
 
     @classmethod
-    def cat(cls, batches: Sequence[Self]) -> Self:
+    def cat(cls: type[B], batches: Sequence[B]) -> B:
         """Join batches along the first axis; at least one is needed."""
         if not batches:
             raise ValueError(f"{cls.__name__}.cat: expected at least one batch, found none")

@@ -38,7 +38,7 @@ def axis_angle(axis: Float[Tensor, "*b 3"], angle: Float[Tensor, "*b"]) -> Float
     return eye + sine * cross + (1 - cosine) * (cross @ cross)
 
 
-def rotation_angle(a: Float[Tensor, "*b 3 3"], b: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
+def rotation_angle(a: Float[Tensor, "*#b 3 3"], b: Float[Tensor, "*#b 3 3"]) -> Float[Tensor, "*b"]:
     """Return the geodesic angle between rotations (rad), accurate near 0 and near pi."""
     chord = torch.linalg.matrix_norm(a - b) / (2 * 2**0.5)
     return 2 * torch.asin(chord.clamp(max=1.0))

@@ -8,6 +8,15 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import pytest
 import torch
+from jaxtyping import install_import_hook
+
+# Shapes in signatures are true: checked in the modules of data and geometry (not in compiled ones, which numba pickles).
+CHECKED = "batch backbone contact_frame evaluation execution fidelity geometry grasps hand kinematics representation"
+CHECKED += " scene selection urdf"
+install_import_hook(
+    [f"dexgrasp.{module}" for module in CHECKED.split()] + ["dexgrasp_contact", "dexgrasp_pose", "dexgrasp_pointnet"],
+    "dexgrasp.testing.shapes.check",
+)
 
 from dexgrasp import geometry
 from dexgrasp.hand import Finger, Hand
