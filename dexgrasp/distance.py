@@ -10,13 +10,13 @@ from numba import njit
 
 from dexgrasp.errors import DexgraspError
 from dexgrasp.quality import Array
-from dexgrasp.triangle_tree import TriangleTree, nearest, triangle_tree
+from dexgrasp.triangle_tree import TriangleTree, nearest, to_triangle, triangle_tree
 
 STRIDE = 4
 """Grid nodes per coarse node: away from the surface, fine nodes are bounded from coarse ones."""
 BAND = 2.0
 """Nodes that may be nearer to the surface than this many spacings hold the exact distance."""
-PADDING = 4
+PADDING = 10
 """Spacings by which the grid reaches beyond the object."""
 ROUNDING = 1e-7
 """Taken off what is stored in single precision, m."""
@@ -126,7 +126,7 @@ def _fill(
 
 @njit(cache=True)
 def lower_bound(field: Field, x: float, y: float, z: float) -> float:
-    """Return a lower bound of the signed distance at a point (m), from one grid node."""
+    """Return a lower bound of the signed distance at a point (m), from the eight grid nodes about it."""
     h = field.spacing
     u, v, w = (x - field.origin[0]) / h, (y - field.origin[1]) / h, (z - field.origin[2]) / h
     nx, ny, nz = field.values.shape
@@ -136,9 +136,15 @@ def lower_bound(field: Field, x: float, y: float, z: float) -> float:
         dy = max(box[1] - y, y - box[4], 0.0)
         dz = max(box[2] - z, z - box[5], 0.0)
         return math.sqrt(dx * dx + dy * dy + dz * dz)
-    i, j, k = int(u + 0.5), int(v + 0.5), int(w + 0.5)
-    away = h * math.sqrt((u - i) ** 2 + (v - j) ** 2 + (w - k) ** 2)
-    return field.values[i, j, k] - away
+    i, j, k = min(int(u), nx - 2), min(int(v), ny - 2), min(int(w), nz - 2)
+    u, v, w = u - i, v - j, w - k
+    best = -np.inf
+    for a in range(2):
+        for b in range(2):
+            for c in range(2):
+                away = math.sqrt((u - a) * (u - a) + (v - b) * (v - b) + (w - c) * (w - c))
+                best = max(best, field.values[i + a, j + b, k + c] - h * away)
+    return best
 
 
 @njit(cache=True)
@@ -150,6 +156,25 @@ def seed_at(field: Field, x: float, y: float, z: float) -> int:
     j = min(max(int((y - field.origin[1]) / h + 0.5), 0), ny - 1)
     k = min(max(int((z - field.origin[2]) / h + 0.5), 0), nz - 1)
     return field.seeds[i, j, k]
+
+
+@njit(cache=True)
+def estimate(field: Field, x: float, y: float, z: float) -> float:
+    """Return an upper bound of the unsigned distance at a point of the grid, mostly exact: its cell's triangles."""
+    h = field.spacing
+    nx, ny, nz = field.values.shape
+    i = min(max(int((x - field.origin[0]) / h), 0), nx - 2)
+    j = min(max(int((y - field.origin[1]) / h), 0), ny - 2)
+    k = min(max(int((z - field.origin[2]) / h), 0), nz - 2)
+    best, last, other = np.inf, -1, -1
+    for a in range(2):
+        for b in range(2):
+            for c in range(2):
+                seed = field.seeds[i + a, j + b, k + c]
+                if seed != last and seed != other:
+                    best = min(best, to_triangle(field.tree.corners, seed, x, y, z)[0])
+                    last, other = seed, last
+    return math.sqrt(best)
 
 
 @njit(cache=True)

@@ -101,14 +101,14 @@ def _build(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
 
 
 @njit(cache=True)
-def _to_triangle(corners: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float, int]:
+def to_triangle(corners: np.ndarray, t: int, x: float, y: float, z: float) -> tuple[float, float, float, int]:
     """Return squared distance, barycentric weights of corners 1 and 2, and the feature nearest to a point.
 
     Regions after Ericson, Real-Time Collision Detection, 5.1.5; features are numbered as in `TriangleTree.normals`.
     """
-    ax, ay, az = corners[0, 0], corners[0, 1], corners[0, 2]
-    e1x, e1y, e1z = corners[1, 0] - ax, corners[1, 1] - ay, corners[1, 2] - az
-    e2x, e2y, e2z = corners[2, 0] - ax, corners[2, 1] - ay, corners[2, 2] - az
+    ax, ay, az = corners[t, 0, 0], corners[t, 0, 1], corners[t, 0, 2]
+    e1x, e1y, e1z = corners[t, 1, 0] - ax, corners[t, 1, 1] - ay, corners[t, 1, 2] - az
+    e2x, e2y, e2z = corners[t, 2, 0] - ax, corners[t, 2, 1] - ay, corners[t, 2, 2] - az
     px, py, pz = x - ax, y - ay, z - az
     d1 = e1x * px + e1y * py + e1z * pz
     d2 = e2x * px + e2y * py + e2z * pz
@@ -138,10 +138,10 @@ def _to_triangle(corners: np.ndarray, x: float, y: float, z: float) -> tuple[flo
 
 
 @njit(cache=True)
-def _to_box(box: np.ndarray, x: float, y: float, z: float) -> float:
-    dx = max(box[0] - x, x - box[3], 0.0)
-    dy = max(box[1] - y, y - box[4], 0.0)
-    dz = max(box[2] - z, z - box[5], 0.0)
+def _to_box(boxes: np.ndarray, node: int, x: float, y: float, z: float) -> float:
+    dx = max(boxes[node, 0] - x, x - boxes[node, 3], 0.0)
+    dy = max(boxes[node, 1] - y, y - boxes[node, 4], 0.0)
+    dz = max(boxes[node, 2] - z, z - boxes[node, 5], 0.0)
     return dx * dx + dy * dy + dz * dz
 
 
@@ -152,27 +152,28 @@ def nearest(tree: TriangleTree, x: float, y: float, z: float, seed: int, out: np
     `seed` is a triangle that is probably near. The normal is the direction of steepest distance; on the surface
     itself it is the pseudonormal.
     """
-    best, v, w, feature = _to_triangle(tree.corners[seed], x, y, z)
+    boxes, right, sizes, corners, normals = tree
+    best, v, w, feature = to_triangle(corners, seed, x, y, z)
     triangle = seed
     stack = np.empty(64, np.int64)
     keys = np.empty(64)
-    stack[0], keys[0] = 0, _to_box(tree.boxes[0], x, y, z)
+    stack[0], keys[0] = 0, _to_box(boxes, 0, x, y, z)
     top = 1
     while top:
         top -= 1
         if keys[top] >= best:
             continue
         node = stack[top]
-        size = tree.sizes[node]
+        size = sizes[node]
         if size:
-            first = -1 - tree.right[node]
+            first = -1 - right[node]
             for t in range(first, first + size):
-                square, v_t, w_t, feature_t = _to_triangle(tree.corners[t], x, y, z)
+                square, v_t, w_t, feature_t = to_triangle(corners, t, x, y, z)
                 if square < best:
                     best, v, w, feature, triangle = square, v_t, w_t, feature_t, t
             continue
-        one, two = node + 1, tree.right[node]
-        near, far = _to_box(tree.boxes[one], x, y, z), _to_box(tree.boxes[two], x, y, z)
+        one, two = node + 1, right[node]
+        near, far = _to_box(boxes, one, x, y, z), _to_box(boxes, two, x, y, z)
         if near > far:
             one, two, near, far = two, one, far, near
         if far < best:
@@ -181,13 +182,12 @@ def nearest(tree: TriangleTree, x: float, y: float, z: float, seed: int, out: np
         if near < best:
             stack[top], keys[top] = one, near
             top += 1
-    a, b, c = tree.corners[triangle, 0], tree.corners[triangle, 1], tree.corners[triangle, 2]
-    normal = tree.normals[triangle, feature]
+    nx, ny, nz = normals[triangle, feature, 0], normals[triangle, feature, 1], normals[triangle, feature, 2]
     distance = np.sqrt(best)
-    side = 0.0
     for k in range(3):
-        out[1 + k] = a[k] + v * (b[k] - a[k]) + w * (c[k] - a[k])
-    side = (x - out[1]) * normal[0] + (y - out[2]) * normal[1] + (z - out[3]) * normal[2]
+        a = corners[triangle, 0, k]
+        out[1 + k] = a + v * (corners[triangle, 1, k] - a) + w * (corners[triangle, 2, k] - a)
+    side = (x - out[1]) * nx + (y - out[2]) * ny + (z - out[3]) * nz
     sign = 1.0 if side >= 0 else -1.0
     out[0] = sign * distance
     if distance > 1e-9:
@@ -195,5 +195,5 @@ def nearest(tree: TriangleTree, x: float, y: float, z: float, seed: int, out: np
         out[5] = sign * (y - out[2]) / distance
         out[6] = sign * (z - out[3]) / distance
     else:
-        out[4], out[5], out[6] = normal[0], normal[1], normal[2]
+        out[4], out[5], out[6] = nx, ny, nz
     return triangle

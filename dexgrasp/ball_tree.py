@@ -1,0 +1,111 @@
+"""A link's surface as balls: each touches it from inside, and bounding balls above them make a tree.
+
+Balls inscribed at surface points follow a rounded finger far more closely than they are apart: between two balls of
+radius r at distance s the surface is missed by s^2 / 8 r only.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+PROTRUSION = 3e-5
+"""How far a ball may stand out of its part, m: what lets balls bridge the facets of a round surface."""
+
+
+def planes(part: trimesh.Trimesh) -> np.ndarray:
+    """Return the half-spaces (K, 4) of a convex part: normal . x <= offset inside, m."""
+    normals = part.face_normals
+    offsets = np.einsum("ij,ij->i", normals, part.triangles[:, 0])
+    keys = np.round(np.column_stack([normals, offsets * 1e2]), 7)
+    _, first = np.unique(keys, axis=0, return_index=True)
+    return np.column_stack([normals, offsets])[np.sort(first)]
+
+
+def inscribed_balls(
+    parts: Sequence[trimesh.Trimesh], tolerance: float, extra: np.ndarray | None = None
+) -> tuple[np.ndarray, int]:
+    """Return balls (B, 4) of centre and radius (m) that fill the union of convex parts from inside its surface.
+
+    Every point of a lattice on the surface, 20 tolerances wide, lies within `tolerance` (m) of some ball. `extra` (4,)
+    is one more ball, which comes first where it lies inside a part up to a tenth of a millimetre; the second value is
+    its place in the result, or -1.
+    """
+    bodies = [planes(part) for part in parts]
+    found, surface = [], []
+    for number, part in enumerate(parts):
+        points, normals = _lattice(part, min(20 * tolerance, 1.5e-3))
+        buried = np.zeros(len(points), dtype=bool)
+        for other, body in enumerate(bodies):
+            if other != number:
+                buried |= (points @ body[:, :3].T - body[:, 3]).max(axis=1) < -1e-6
+        points, normals = points[~buried], normals[~buried]
+        body = bodies[number]
+        slack = np.maximum(body[:, 3] - points @ body[:, :3].T, 0) + PROTRUSION
+        slope = 1 - normals @ body[:, :3].T
+        radius = np.where(slope > 1e-9, slack / np.maximum(slope, 1e-9), np.inf).min(axis=1)
+        found.append(np.column_stack([points - radius[:, None] * normals, radius]))
+        surface.append(points)
+    balls, touched = np.concatenate(found), np.concatenate(surface)
+    first = -1
+    if extra is not None and any((body[:, :3] @ extra[:3] + extra[3] - body[:, 3]).max() < 1e-4 for body in bodies):
+        balls, first = np.concatenate([extra[None], balls]), 0
+    # Large balls first, each kept only if it reaches a point of the surface that is still bare.
+    order = np.lexsort((*balls[:, :3].T, -np.round(balls[:, 3], 6)))
+    if first == 0:
+        order = np.concatenate([[0], order[order > 0]])
+    near = cKDTree(touched)
+    bare = np.ones(len(touched), dtype=bool)
+    kept = []
+    for place in order:
+        if place != first and not bare[place - (first == 0)]:
+            continue
+        bare[near.query_ball_point(balls[place, :3], balls[place, 3] + tolerance)] = False
+        kept.append(place)
+    return balls[kept], first
+
+
+def _lattice(part: trimesh.Trimesh, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return points on the faces of a mesh, rows at most `spacing` apart, and their face normals."""
+    points, normals = [], []
+    for triangle, normal in zip(part.triangles, part.face_normals, strict=True):
+        lengths = np.linalg.norm(np.roll(triangle, -1, axis=0) - triangle, axis=1)
+        start = int(lengths.argmin())
+        a, b, c = np.roll(triangle, -start, axis=0)  # the shortest edge is a-b
+        rows = int(np.ceil(max(np.linalg.norm(c - a), np.linalg.norm(c - b)) / spacing))
+        for row in range(rows + 1):
+            left, right = a + (c - a) * row / rows, b + (c - b) * row / rows
+            steps = int(np.ceil(np.linalg.norm(right - left) / spacing))
+            weights = np.linspace(0, 1, steps + 1)[:, None] if steps else np.zeros((1, 1))
+            points.append(left + (right - left) * weights)
+            normals.append(np.repeat(normal[None], len(points[-1]), axis=0))
+    return np.concatenate(points), np.concatenate(normals)
+
+
+def ball_tree(leaves: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return balls (M, 4), children (M, 2; -1 for a leaf) and the place of each leaf (B,) of a binary tree, root 0."""
+    balls, children = np.empty((2 * len(leaves) - 1, 4)), np.full((2 * len(leaves) - 1, 2), -1)
+    places = np.empty(len(leaves), dtype=np.int64)
+    stack = [(np.arange(len(leaves)), -1, 0)]
+    count = 0
+    while stack:
+        members, parent, side = stack.pop()
+        node, count = count, count + 1
+        if parent >= 0:
+            children[parent, side] = node
+        if len(members) == 1:
+            balls[node], places[members[0]] = leaves[members[0]], node
+            continue
+        inside = leaves[members]
+        low = (inside[:, :3] - inside[:, 3:]).min(axis=0)
+        high = (inside[:, :3] + inside[:, 3:]).max(axis=0)
+        center = (low + high) / 2
+        balls[node, :3] = center
+        balls[node, 3] = (np.linalg.norm(inside[:, :3] - center, axis=1) + inside[:, 3]).max()
+        spread = np.ptp(inside[:, :3], axis=0)
+        order = np.argsort(inside[:, int(spread.argmax())], kind="stable")
+        half = len(members) // 2
+        stack.append((members[order[half:]], node, 1))
+        stack.append((members[order[:half]], node, 0))
+    return balls, children, places
