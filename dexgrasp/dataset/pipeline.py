@@ -23,7 +23,7 @@ from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.store import Item, Shard, Store, digest, lock, write_shard
 from dexgrasp.errors import DexgraspError
 from dexgrasp.objects import load_objects
-from dexgrasp.plugins import load_class
+from dexgrasp.plugins import build_hand, build_representation, load_class
 from dexgrasp.progress import track
 
 REVISION = 1
@@ -56,6 +56,7 @@ def ensure(
     """
     settings, hand = _plain(config), _plain(hand)
     told = None if representation is None else _plain(representation)
+    _check(settings, hand, told)
     root = Path(settings["root"]).expanduser().absolute()
     folders: dict[str, Path] = {}
     parent = ""
@@ -86,6 +87,14 @@ def table(rows: Sequence[Made]) -> str:
         f"{row.stage:10}{row.items:8d}{row.bytes / 1e6:9.1f} MB{row.seconds:8.1f} s  {row.folder}" for row in rows
     ]
     return "\n".join(lines)
+
+
+def _check(settings: dict[str, Any], hand: dict[str, Any], told: dict[str, Any] | None) -> None:
+    """Find what is wrong before anything is written."""
+    stages.Settings.read(settings)
+    built = build_hand(hand)
+    if told is not None:
+        build_representation(told, built, channels=1)
 
 
 def _content(stage: str, settings: dict[str, Any], hand: dict[str, Any], told: dict[str, Any] | None) -> dict[str, Any]:
@@ -160,10 +169,10 @@ def _run(
 ) -> None:
     if _finished(folder):
         return
+    work = inputs()
     with lock(folder):
         if _finished(folder):
             return
-        work = inputs()
         # Small enough to keep every worker busy, large enough not to litter; the same for any number of workers.
         per_shard = min(max(math.ceil(len(work) / 32), 1), 16)
         count = math.ceil(len(work) / per_shard)

@@ -115,16 +115,15 @@ def _edges(depth: Float[np.ndarray, "H W"], step: float) -> Bool[np.ndarray, "H 
 
 
 def capture(
-    meshes: Sequence[trimesh.Trimesh] | RayScene,
+    meshes: Sequence[trimesh.Trimesh],
     poses: Float[Tensor, "O 4 4"],
     world_T_camera: Float[Tensor, "4 4"],
     sensor: Sensor,
     framing: Framing,
     generator: np.random.Generator,
 ) -> View:
-    """Return one camera's view of meshes at world_T_object `poses` on the table (a `RayScene` may stand for them)."""
-    scene = meshes if isinstance(meshes, RayScene) else RayScene(meshes, poses)
-    rendering = scene.render(sensor.camera, world_T_camera)
+    """Return one camera's view of meshes at world_T_object `poses` on the table."""
+    rendering = RayScene(meshes, poses).render(sensor.camera, world_T_camera)
     depth = sensor.measure(rendering, generator)
     return observe(depth, sensor.camera, world_T_camera, framing, generator, rendering.instance)
 

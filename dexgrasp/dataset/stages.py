@@ -1,10 +1,12 @@
 """What each stage makes: one item of a store from its number. These run in worker processes."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
 
-from dexgrasp.dataset.camera import RayScene, Viewpoints
+from dexgrasp.dataset.camera import Viewpoints
 from dexgrasp.dataset.clutter import Approach, Clutter, approachable, build_scene, feasible
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.labels import LabelSettings, label
@@ -12,6 +14,7 @@ from dexgrasp.dataset.sensor import Framing, Sensor, capture
 from dexgrasp.dataset.store import Item
 from dexgrasp.dataset.synthesis import SynthesisSettings, synthesize
 from dexgrasp.dataset.truth import Truth, TruthSettings
+from dexgrasp.errors import DexgraspError
 from dexgrasp.grasps import Grasps
 from dexgrasp.objects import Object, object_to_tensors
 from dexgrasp.plugins import build_representation
@@ -31,10 +34,9 @@ def make_object(index: int, item: Object) -> Item:
 
 def make_grasps(dataset: Dataset, index: int) -> Item:
     """Synthesise the grasps of object `index` and keep those that the hand can reach."""
-    config, item = dataset.config, dataset.objects[index]
-    settings = SynthesisSettings(**config["synthesis"])
-    grasps, summary = synthesize(dataset.hand, item, settings, config["seed"])
-    free = approachable(dataset.shape, dataset.hand, dataset.field(index), grasps, Approach(**config["approach"]))
+    settings, item = Settings.read(dataset.config), dataset.objects[index]
+    grasps, summary = synthesize(dataset.hand, item, settings.synthesis, dataset.config["seed"])
+    free = approachable(dataset.shape, dataset.hand, dataset.field(index), grasps, settings.approach)
     facts = {"name": item.name, "found": len(grasps), "kept": int(free.sum()), "summary": vars(summary)}
     return Item(key(index), grasps[free].to(torch.float32).tensors(), facts)
 
@@ -42,21 +44,20 @@ def make_grasps(dataset: Dataset, index: int) -> Item:
 def make_scene(dataset: Dataset, index: int) -> Item:
     """Lay out scene `index` and find, among some grasps of each object, those that are free of all others."""
     config, objects = dataset.config, dataset.objects
-    settings = dict(config["scenes"])
-    per_object, _ = settings.pop("grasps_per_object"), settings.pop("count")
+    settings = Settings.read(config)
     simulator = MujocoSimulator(config["simulator"]["settling"])
-    scene = build_scene(objects, _tuples(Clutter, settings), simulator, config["seed"], index)
+    scene = build_scene(objects, settings.clutter, simulator, config["seed"], index)
     numbers = [objects.names.index(name) for name in scene.objects]
     chosen, moved = [], [dataset.grasps(0)[:0].to(torch.float64)]
     for row, number in enumerate(numbers):
         grasps = dataset.grasps(number)
-        draw = stream(config["seed"], "scene grasps", index, row).permutation(len(grasps))[:per_object]
+        draw = stream(config["seed"], "scene grasps", index, row).permutation(len(grasps))[: settings.grasps_per_object]
         chosen.append(torch.from_numpy(draw))
         world = grasps[chosen[-1]].to(torch.float64).moved(scene.poses[row])
         moved.append(world.replace(object=torch.full((len(world),), row)))
     grasps = Grasps.cat(moved)
-    fields = [dataset.field(number) for number in numbers]
-    free = feasible(dataset.shape, dataset.hand, grasps, scene.poses, fields, Approach(**config["approach"]))
+    obstacles = [dataset.field(number) for number in numbers]
+    free = feasible(dataset.shape, dataset.hand, grasps, scene.poses, obstacles, settings.approach)
     tensors = {
         "poses": scene.poses,
         "object": torch.tensor(numbers, dtype=torch.int32),
@@ -69,15 +70,13 @@ def make_scene(dataset: Dataset, index: int) -> Item:
 
 def make_view(dataset: Dataset, index: int) -> Item:
     """Look at a scene from a random viewpoint."""
-    config = dataset.config
+    settings = Settings.read(dataset.config)
     number = dataset.scene_of(index)
     scene = dataset.scene(number)
-    generator = stream(config["seed"], "view", index)
-    world_T_camera = _tuples(Viewpoints, config["views"]["viewpoints"]).draw(generator)
-    ray_scene = RayScene([dataset.objects[name].mesh for name in scene.objects], scene.poses)
-    sensor = Sensor.build(config["camera"])
-    framing = _tuples(Framing, config["views"]["framing"])
-    view = capture(ray_scene, scene.poses, world_T_camera, sensor, framing, generator)
+    generator = stream(dataset.config["seed"], "view", index)
+    world_T_camera = settings.viewpoints.draw(generator)
+    meshes = [dataset.objects[name].mesh for name in scene.objects]
+    view = capture(meshes, scene.poses, world_T_camera, settings.sensor, settings.framing, generator)
     tensors = {
         "points": view.points,
         "normals": view.normals,
@@ -91,18 +90,62 @@ def make_view(dataset: Dataset, index: int) -> Item:
 def make_labels(dataset: Dataset, index: int) -> Item:
     """Tell the grasps of a view in the dataset's representation, keeping what is true."""
     assert dataset.representation is not None
-    config = dataset.config
+    settings = Settings.read(dataset.config)
     view, grasps = dataset.view(index), dataset.view_grasps(index)
     number = dataset.scene_of(index)
     poses = view.world_T_camera.double().inverse() @ dataset.scene(number).poses
     bodies = [dataset.body(i) for i in dataset.scene_objects(number).tolist()]
-    truth = Truth(dataset.closer, bodies, poses, TruthSettings(**config["labels"]["truth"]))
+    truth = Truth(dataset.closer, bodies, poses, settings.truth)
     representation = build_representation(dataset.representation, dataset.hand, channels=1)
-    found = label(view, grasps, representation, truth.holds, LabelSettings(**config["labels"]["points"]))
+    found = label(view, grasps, representation, truth.holds, settings.points)
     facts = {"points": len(found), "true": int(found.true.sum()), "grasps": len(grasps)}
     return Item(key(index), found.tensors(), facts)
 
 
-def _tuples(kind: Any, config: dict[str, Any]) -> Any:
-    """Build a settings dataclass from JSON-like values, lists becoming tuples."""
-    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in config.items()})
+@dataclass(frozen=True)
+class Settings:
+    """The `dataset` config as the dataclasses of its parts."""
+
+    synthesis: SynthesisSettings
+    approach: Approach
+    clutter: Clutter
+    scenes: int
+    grasps_per_object: int
+    sensor: Sensor
+    viewpoints: Viewpoints
+    framing: Framing
+    points: LabelSettings
+    truth: TruthSettings
+
+    @classmethod
+    def read(cls, config: Mapping[str, Any]) -> "Settings":
+        """Return the settings of a resolved config; raises DexgraspError for unknown or missing keys."""
+        scenes, views, labels = dict(config["scenes"]), config["views"], config["labels"]
+        count, per_object = scenes.pop("count"), scenes.pop("grasps_per_object")
+        if count < 1 or views["per_scene"] < 0:
+            found = f"{count} scenes, {views['per_scene']} views of each"
+            raise DexgraspError("at least one scene, no negative number of views", found, "correct the dataset's YAML")
+        return cls(
+            _build("synthesis", SynthesisSettings, config["synthesis"]),
+            _build("approach", Approach, config["approach"]),
+            _build("scenes", Clutter, scenes),
+            count,
+            per_object,
+            Sensor.build(config["camera"]),
+            _build("views.viewpoints", Viewpoints, views["viewpoints"]),
+            _build("views.framing", Framing, views["framing"]),
+            _build("labels.points", LabelSettings, labels["points"]),
+            _build("labels.truth", TruthSettings, labels["truth"]),
+        )
+
+
+def _build(name: str, kind: Any, config: Mapping[str, Any]) -> Any:
+    """Build a dataclass from JSON-like values, lists becoming tuples."""
+    known = [field.name for field in fields(kind)]
+    unknown = sorted(set(config) - set(known))
+    if unknown:
+        raise DexgraspError(f"keys of dataset.{name} among {known}", ", ".join(unknown), "correct or remove them")
+    try:
+        return kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in config.items()})
+    except TypeError as cause:
+        raise DexgraspError(f"all keys of dataset.{name}: {known}", str(cause), "add what is missing") from cause

@@ -1,0 +1,194 @@
+"""The dataset end to end, small: made once, the same for any number of workers, found again, repaired."""
+
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, open_dict
+
+from dexgrasp import config as settings
+from dexgrasp.commands.dataset import tool
+from dexgrasp.dataset import pipeline
+from dexgrasp.dataset.dataset import Dataset
+from dexgrasp.dataset.pipeline import ensure, summary, table
+from dexgrasp.dataset.store import Store
+from dexgrasp.errors import DexgraspError
+from dexgrasp.geometry import inverse
+
+TINY = [
+    "dataset=smoke",
+    "dataset.objects.count=2",
+    "dataset.scenes.count=4",
+    "dataset.scenes.counts=[2]",
+    "dataset.views.framing.points=2048",
+]
+"""One shard an item, so that several workers have work."""
+
+
+def composed(root: Path, *overrides: str) -> DictConfig:
+    settings.register()
+    with initialize_config_dir(str(settings.conf_folder()), version_base="1.3"):
+        return compose("dataset", overrides=[*TINY, f"dataset.root={root}", *overrides])
+
+
+def make(config: DictConfig) -> Dataset:
+    return ensure(config.dataset, config.hand, config.repr)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[DictConfig, Dataset]:
+    config = composed(tmp_path_factory.mktemp("data"), "dataset.workers=1")
+    return config, make(config)
+
+
+@pytest.fixture
+def copy(made: tuple[DictConfig, Dataset], tmp_path: Path) -> Iterator[tuple[DictConfig, Dataset]]:
+    """A dataset whose files may be damaged."""
+    config = made[0].copy()
+    subprocess.run(["cp", "-r", str(made[0].dataset.root), str(tmp_path / "data")], check=True)
+    with open_dict(config):
+        config.dataset.root = str(tmp_path / "data")
+    yield config, make(config)
+
+
+def manifests(dataset: Dataset) -> dict[str, list[str]]:
+    found = {}
+    for stage, folder in dataset.folders.items():
+        shards = json.loads((folder / "manifest.json").read_text())["shards"]
+        found[stage] = [shards[i]["sha256"] for i in sorted(shards, key=int)]
+    return found
+
+
+def test_flow_is_consistent(made: tuple[DictConfig, Dataset]) -> None:
+    dataset = made[1]
+    assert len(dataset.objects) == 2 and dataset.scenes == 4 and len(dataset) == 4
+    assert list(dataset.split("train")) == [0, 1, 2] and list(dataset.split("validation")) == [3]
+    assert sum(len(dataset.view_grasps(i)) for i in range(4)) > 0
+    for index in range(4):
+        view, grasps, scene = dataset.view(index), dataset.view_grasps(index), dataset.scene(dataset.scene_of(index))
+        assert len(view) == 2048 and view.instance.max() < len(scene)
+        camera_T_object = inverse(view.world_T_camera.double()) @ scene.poses
+        for row, name in enumerate(scene.objects):
+            # Grasps of a view touch the object that the view shows there.
+            own = grasps[grasps.object == row]
+            field = dataset.field(dataset.objects.names.index(name))
+            local = own.moved(inverse(camera_T_object[row]))
+            if len(own):
+                assert field.distance(local.contacts.reshape(-1, 3).double()).abs().max() < 5e-4
+            points = view.points[view.instance == row].double()
+            seen = points @ inverse(camera_T_object[row])[:3, :3].T + inverse(camera_T_object[row])[:3, 3]
+            if len(seen):
+                assert field.distance(seen).abs().median() < 0.002
+        targets = dataset.labels(index).targets(len(view))
+        assert len(targets) == 2048
+
+
+def test_found_again_and_independent_of_workers(made: tuple[DictConfig, Dataset], tmp_path: Path) -> None:
+    config, dataset = made
+    before = {path: path.stat().st_mtime_ns for path in Path(config.dataset.root).rglob("*.tar")}
+    assert make(config).folders == dataset.folders
+    assert {path: path.stat().st_mtime_ns for path in Path(config.dataset.root).rglob("*.tar")} == before
+    other = composed(tmp_path / "data", "dataset.workers=2")
+    assert manifests(make(other)) == manifests(dataset)
+
+
+def test_settings_pick_the_stores(made: tuple[DictConfig, Dataset]) -> None:
+    config = made[0]
+    plain, hand, told = (pipeline._plain(part) for part in (config.dataset, config.hand, config.repr))
+
+    def hashes(**changes: object) -> list[str]:
+        return [pipeline.digest(pipeline._content(s, plain | changes, hand, told)) for s in pipeline.STAGES]
+
+    same = hashes()
+    assert hashes(workers=7, root="elsewhere", validation=0.5, name="x") == same
+    views = hashes(camera=plain["camera"] | {"fx": 600.0})
+    assert [a == b for a, b in zip(same, views, strict=True)] == [True, True, True, False, True]
+    assert hashes(seed=5)[1:4] != same[1:4]
+    assert pipeline._identity(hand | {"urdf": hand["urdf"]})["urdf"] != hand["urdf"]
+    heavier = pipeline._content("labels", plain, hand, told | {"alpha": 9.0})
+    assert heavier == pipeline._content("labels", plain, hand, told), "loss weights do not change labels"
+
+
+def test_travels_by_folder(made: tuple[DictConfig, Dataset]) -> None:
+    dataset = made[1]
+    text = pickle.dumps(dataset)
+    assert len(text) < 20_000
+    again = pickle.loads(text)
+    assert torch.equal(again.view(0).points, dataset.view(0).points)
+    assert pickle.loads(text) is again, "copies in one process share their caches"
+
+
+def test_lost_shard_is_made_again(copy: tuple[DictConfig, Dataset]) -> None:
+    config, dataset = copy
+    before = manifests(dataset)
+    lost = sorted(dataset.folders["scenes"].glob("*.tar"))[1]
+    lost.unlink()
+    with pytest.raises(DexgraspError, match="shards in"):
+        Store.open(dataset.folders["scenes"])
+    assert manifests(make(config)) == before and lost.exists()
+
+
+def test_damaged_shard_is_named(copy: tuple[DictConfig, Dataset], capsys: pytest.CaptureFixture[str]) -> None:
+    config, dataset = copy
+    root = Path(config.dataset.root)
+    assert tool(["verify", str(root)]) == 0
+    assert tool(["inspect", str(dataset.folders["views"])]) == 0
+    printed = capsys.readouterr().out
+    assert "views, 4 items" in printed and "points (2048, 3) float32" in printed
+    shard = sorted(dataset.folders["views"].glob("*.tar"))[2]
+    shard.write_bytes(shard.read_bytes()[:5000])
+    for attempt in (lambda: make(config), lambda: tool(["verify", str(root)])):
+        with pytest.raises(DexgraspError) as error:
+            attempt()
+        assert str(shard) in str(error.value) and "5000 bytes" in str(error.value)
+    shard.unlink()
+    make(config)
+    assert tool(["verify", str(root)]) == 0
+    with pytest.raises(DexgraspError, match=r"manifest\.json"):
+        tool(["verify", str(root / "nothing")])
+
+
+def test_summary(made: tuple[DictConfig, Dataset]) -> None:
+    rows = summary(made[1])
+    assert [row.stage for row in rows] == list(pipeline.STAGES)
+    assert [row.items for row in rows] == [2, 2, 4, 4, 4] and all(row.bytes > 0 for row in rows)
+    assert str(made[1].folders["views"]) in table(rows)
+
+
+def test_bad_settings_leave_no_trace(tmp_path: Path) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    config = composed(tmp_path / "data")
+    with open_dict(config):
+        config.dataset.objects = {"kind": "folder", "path": str(empty)}
+    with pytest.raises(DexgraspError):
+        make(config)
+    wrong = composed(tmp_path / "data", "+dataset.scenes.colour=red")
+    with pytest.raises(DexgraspError, match="colour"):
+        make(wrong)
+    assert not (tmp_path / "data").exists()
+
+
+def test_interrupt_leaves_whole_shards_and_is_taken_up(made: tuple[DictConfig, Dataset], tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "dexgrasp", "dataset", *TINY, f"dataset.root={tmp_path / 'data'}"]
+    run = subprocess.Popen(
+        [*command, "dataset.workers=2"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=tmp_path
+    )
+    started = time.monotonic()
+    while not list(tmp_path.rglob("grasps-*/shard-*.tar")) and run.poll() is None and time.monotonic() - started < 120:
+        time.sleep(0.05)
+    os.kill(run.pid, signal.SIGINT)
+    output = run.communicate(timeout=60)[0].decode()
+    assert run.returncode == 130, output
+    assert not list(tmp_path.rglob("*.tmp"))
+    config = composed(tmp_path / "data", "dataset.workers=1")
+    assert manifests(make(config)) == manifests(made[1])
