@@ -54,5 +54,7 @@ class Batch:
 def _to(value: Tensor, *args: Any, **kwargs: Any) -> Tensor:
     if value.is_floating_point():
         return value.to(*args, **kwargs)
-    kept = tuple(arg.device if isinstance(arg, Tensor) else arg for arg in args if not isinstance(arg, torch.dtype))
+    kept: tuple[Any, ...] = tuple(
+        arg.device if isinstance(arg, Tensor) else arg for arg in args if not isinstance(arg, torch.dtype)
+    )
     return value.to(*kept, **{key: arg for key, arg in kwargs.items() if key != "dtype"})

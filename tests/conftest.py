@@ -10,16 +10,18 @@ import pytest
 import torch
 from jaxtyping import install_import_hook
 
-# Shapes in signatures are true: checked in the modules of data and geometry (not in compiled ones, which numba pickles).
+from dexgrasp.testing import shapes
+
+# Shapes in signatures are true: checked in the modules of data and geometry, not in compiled ones (numba pickles them).
 CHECKED = "batch backbone contact_frame evaluation execution fidelity geometry grasps hand kinematics representation"
 CHECKED += " scene selection urdf"
 install_import_hook(
     [f"dexgrasp.{module}" for module in CHECKED.split()] + ["dexgrasp_contact", "dexgrasp_pose", "dexgrasp_pointnet"],
-    "dexgrasp.testing.shapes.check",
+    f"{shapes.__name__}.check",
 )
 
-from dexgrasp import geometry
-from dexgrasp.hand import Finger, Hand
+from dexgrasp import geometry  # noqa: E402
+from dexgrasp.hand import Finger, Hand  # noqa: E402
 
 torch.set_num_threads(1)
 

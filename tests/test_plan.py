@@ -4,6 +4,8 @@ import ast
 from pathlib import Path
 
 import pytest
+import torch
+from jaxtyping import TypeCheckError
 
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = {
@@ -107,3 +109,11 @@ def test_no_robot_is_known_by_name():
                 assert not any(f"'{name}'" in compared for name in ("barrett", "allegro", "shadow")), (
                     f"{module}: {compared}"
                 )
+
+
+def test_shapes_in_signatures_are_checked_under_pytest():
+    from dexgrasp.geometry import pose
+
+    with pytest.raises(TypeCheckError):
+        pose(torch.eye(3), torch.zeros(4))
+    assert pose(torch.eye(3), torch.zeros(3)).shape == (4, 4)
