@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from dexgrasp.errors import DexgraspError
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
-from dexgrasp.representation import Targets
+from dexgrasp.representation import Prediction, Targets
 
 CERTAIN = 100.0
 """Logit of the true class in `as_prediction`: its probability is 1 in float32."""
@@ -166,6 +166,18 @@ def told_grasps(
         contacts=torch.where(touching, points.unsqueeze(1), grasps.contacts),
         normals=torch.where(touching, normals.unsqueeze(1), grasps.normals),
     )
+
+
+def of_finger(prediction: Prediction, finger: Int[Tensor, "N"]) -> Prediction:
+    """Return all outputs but `finger` for the finger that touches; those (N, 1, ...) are the same for every finger."""
+    row = torch.arange(len(finger), device=finger.device)
+    outputs = {name: value for name, value in prediction.items() if name != "finger"}
+    return {name: value[row, finger] if value.shape[1] > 1 else value[:, 0] for name, value in outputs.items()}
+
+
+def every_finger(outputs: Prediction, versions: int) -> Prediction:
+    """Return outputs (N, ...) as `versions` equal ones each, (N, versions, ...); the inverse of `of_finger`."""
+    return {name: torch.stack([value] * versions, dim=1) for name, value in outputs.items()}
 
 
 def known_points(targets: Targets) -> Int[Tensor, "K"]:

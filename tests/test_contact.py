@@ -48,10 +48,10 @@ def any_grasps(hand, count=300, seed=0):
     return points, normals, grasps.replace(pose=grasps.pose @ pose(turn, 0.01 * unit(count, seed + 8)))
 
 
-@pytest.fixture(scope="module")
-def contact(toy_hand):
+@pytest.fixture(scope="module", params=[False, True], ids=["once", "per_finger"])
+def contact(toy_hand, request):
     torch.manual_seed(0)
-    return Contact(toy_hand, 32).eval()
+    return Contact(toy_hand, 32, per_finger=request.param).eval()
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])

@@ -10,10 +10,12 @@ from dexgrasp.heads import (
     Heads,
     JointBins,
     contact_points,
+    every_finger,
     finger_loss,
     known_points,
     mean,
     mlp,
+    of_finger,
     shared_joints,
     told_grasps,
 )
@@ -181,3 +183,14 @@ def test_told_grasps_touch_with_their_finger_only(toy_hand):
     torch.testing.assert_close(grasps.normals[row, finger], normals)
     assert torch.isnan(grasps.contacts).sum() == 5 * 2 * 3
     assert dataclasses.is_dataclass(grasps)
+
+
+def test_the_touching_finger_picks_its_own_outputs():
+    own, once = torch.randn(4, 3, 2), torch.randn(4, 1, 5)
+    finger = torch.tensor([2, 0, 1, 1])
+    picked = of_finger({"finger": torch.zeros(4, 4), "a": own, "b": once}, finger)
+    assert picked.keys() == {"a", "b"}
+    torch.testing.assert_close(picked["a"], torch.stack([own[i, f] for i, f in enumerate(finger)]))
+    torch.testing.assert_close(picked["b"], once[:, 0])
+    again = of_finger(every_finger(picked, 3), finger)
+    assert all(torch.equal(again[name], picked[name]) for name in picked)

@@ -29,10 +29,10 @@ def any_grasps(hand, count=200, seed=0, dtype=torch.float64):
     return points.to(dtype), unit(count, seed + 4, dtype), grasps.to(dtype)
 
 
-@pytest.fixture(scope="module")
-def model(toy_hand):
+@pytest.fixture(scope="module", params=[False, True], ids=["once", "per_finger"])
+def model(toy_hand, request):
     torch.manual_seed(0)
-    return Pose(toy_hand, 32).eval()
+    return Pose(toy_hand, 32, per_finger=request.param).eval()
 
 
 def features(count=63, seed=0):
@@ -73,7 +73,7 @@ def test_every_six_numbers_are_a_rotation(model):
     columns = torch.cat(
         [torch.zeros(1, 6), torch.tensor([[1.0, 0, 0, 2, 0, 0], [0, 0, 0, 0, 1, 0]]), torch.randn(60, 6)]
     )
-    prediction = {**model(features()), "rotation": columns}
+    prediction = {**model(features()), "rotation": columns[:, None].expand(-1, model.versions, -1)}
     told = model.decode(torch.zeros(63, 3), torch.zeros(63, 3), prediction).pose[:, :3, :3]
     torch.testing.assert_close(told @ told.transpose(-1, -2), torch.eye(3).expand(63, 3, 3), atol=1e-5, rtol=0)
     torch.testing.assert_close(torch.linalg.det(told), torch.ones(63))
@@ -104,7 +104,7 @@ def test_weights_of_the_losses_are_options(model, toy_hand):
     reference = model.loss(prediction, targets)
     weights = {"alpha": "finger", "beta_offset": "offset", "beta_rotation": "rotation", "gamma": "joints"}
     for option, term in weights.items():
-        none = Pose(toy_hand, 32, **{option: 0.0}).loss(prediction, targets)
+        none = Pose(toy_hand, 32, per_finger=model.versions > 1, **{option: 0.0}).loss(prediction, targets)
         assert none[term] == 0 and reference[term] > 0
         assert all(none[name] == reference[name] for name in reference if name != term)
 

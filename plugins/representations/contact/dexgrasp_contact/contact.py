@@ -15,9 +15,11 @@ from dexgrasp.heads import (
     Heads,
     JointBins,
     contact_points,
+    every_finger,
     finger_loss,
     known_points,
     mean,
+    of_finger,
     shared_joints,
     told_grasps,
 )
@@ -36,6 +38,8 @@ class Contact(Representation):
     Args:
         hand: any hand.
         channels: size of a point feature.
+        per_finger: tell projection and joints for each finger, so that the one that touches picks its own; else once,
+            as in the paper.
         refine: predict supporting joints from features and the outputs of stages 1 and 2; else from features alone.
         hidden: widths of the hidden layers of each MLP.
         separate_heads: an MLP for each output, as in the paper; else the outputs of a stage share hidden layers.
@@ -55,6 +59,7 @@ class Contact(Representation):
         hand: Hand,
         channels: int,
         *,
+        per_finger: bool = False,
         refine: bool = True,
         hidden: Sequence[int] = (128,),
         separate_heads: bool = False,
@@ -90,9 +95,10 @@ class Contact(Representation):
         self.order: Tensor
         self.kind: Tensor
 
-        each = 2 * self.joints.most
+        self.versions = len(hand.fingers) if per_finger else 1
+        each = 2 * self.joints.most * self.versions
         first = {"finger": len(hand.fingers) + 1}
-        second = {"xy": 2, "main": each * len(self.main_slots)}
+        second = {"xy": 2 * self.versions, "main": each * len(self.main_slots)}
         third = {"supporting": each * len(self.supporting_slots)}
         told_before = sum(first.values()) + sum(second.values()) if refine else 0
         self.stage_1 = Heads(channels, first, hidden, separate=separate_heads)
@@ -123,20 +129,24 @@ class Contact(Representation):
         joint = self.order[finger]
         slots = self.joints.lower[joint].to(points)
         told = self.main_slots + self.supporting_slots
-        logits, residuals = self._joint_outputs(prediction)
+        outputs = of_finger(prediction, finger)
+        logits, residuals = self._joint_outputs(outputs)
         slots[:, told] = self.joints.join(logits, residuals, joint[:, told])
         joints = torch.empty_like(slots).scatter(-1, joint, slots)
-        base = place(self.hand, finger, points, normals, prediction["xy"], joints)
+        base = place(self.hand, finger, points, normals, outputs["xy"], joints)
         return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0])
 
     def forward(self, features: Float[Tensor, "N C"]) -> Prediction:
-        """Run the three stages: finger (N, F + 1) logits, xy (N, 2), main and supporting (N, slots, 2, bins)."""
+        """Run the three stages: finger (N, F + 1) logits, xy (N, V, 2), main and supporting (N, V, slots, 2, bins).
+
+        V is F with `per_finger`, else 1; bins are logits, then residuals.
+        """
         told = self.stage_1(features)
         told |= self.stage_2(features)
         told |= self.stage_3(torch.cat([features, *told.values()], dim=-1) if self.refine else features)
         for name, slots in (("main", self.main_slots), ("supporting", self.supporting_slots)):
-            told[name] = told[name].unflatten(-1, (len(slots), 2, self.joints.most))
-        return told
+            told[name] = told[name].unflatten(-1, (self.versions, len(slots), 2, self.joints.most))
+        return told | {"xy": told["xy"].unflatten(-1, (self.versions, 2))}
 
     def loss(self, prediction: Prediction, targets: Targets) -> dict[str, Tensor]:
         """Return METHOD section 2's terms: finger, projection, main, shared, supporting.
@@ -150,9 +160,10 @@ class Contact(Representation):
         truth, finger = targets.parameters[contact], targets.finger[contact] - 1
         told = self.main_slots + self.supporting_slots
         joint, kind = self.order[finger][:, told], self.kind[finger][:, told]
-        logits, residuals = self._joint_outputs({name: value[contact] for name, value in prediction.items()})
+        outputs = of_finger({name: value[contact] for name, value in prediction.items()}, finger)
+        logits, residuals = self._joint_outputs(outputs)
         joints = self.joints.loss(logits, residuals, truth[:, 2:][:, told], joint, huber=self.huber)
-        projection = torch.linalg.vector_norm(prediction["xy"][contact].to(truth) - truth[:, :2], dim=-1)
+        projection = torch.linalg.vector_norm(outputs["xy"].to(truth) - truth[:, :2], dim=-1)
         terms = {"finger": self.alpha * classes, "projection": self.beta * mean(projection)}
         for index, (name, weight) in enumerate(self.gammas.items()):
             terms[name] = self.gamma * weight * mean(joints * (kind == index))
@@ -162,15 +173,15 @@ class Contact(Representation):
         """Return what a perfect network would put out."""
         finger = (targets.finger - 1).clamp(min=0)
         classes = CERTAIN * F.one_hot(targets.finger, len(self.hand.fingers) + 1).to(targets.parameters)
-        prediction = {"finger": classes, "xy": targets.parameters[:, :2]}
+        outputs = {"xy": targets.parameters[:, :2]}
         for name, slots in (("main", self.main_slots), ("supporting", self.supporting_slots)):
             told = self.joints.as_prediction(targets.parameters[:, 2:][:, slots], self.order[finger][:, slots])
-            prediction[name] = torch.stack(told, dim=-2)
-        return prediction
+            outputs[name] = torch.stack(told, dim=-2)
+        return {"finger": classes} | every_finger(outputs, self.versions)
 
-    def _joint_outputs(self, prediction: Prediction) -> tuple[Tensor, Tensor]:
-        outputs = torch.cat([prediction["main"], prediction["supporting"]], dim=1)
-        return outputs[..., 0, :], outputs[..., 1, :]
+    def _joint_outputs(self, outputs: Prediction) -> tuple[Tensor, Tensor]:
+        logits, residuals = torch.cat([outputs["main"], outputs["supporting"]], dim=1).unbind(-2)
+        return logits, residuals
 
 
 def _kinds(hand: Hand) -> Int[Tensor, "F J"]:

@@ -1,5 +1,6 @@
 """A grasp told outright: where the base is, how it is turned, and every joint."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -10,7 +11,18 @@ from torch.nn import functional as F
 from dexgrasp import geometry
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
-from dexgrasp.heads import CERTAIN, Heads, JointBins, contact_points, finger_loss, known_points, mean, told_grasps
+from dexgrasp.heads import (
+    CERTAIN,
+    Heads,
+    JointBins,
+    contact_points,
+    every_finger,
+    finger_loss,
+    known_points,
+    mean,
+    of_finger,
+    told_grasps,
+)
 from dexgrasp.representation import Prediction, Representation, Targets
 
 
@@ -24,6 +36,7 @@ class Pose(Representation):
     Args:
         hand: any hand.
         channels: size of a point feature.
+        per_finger: tell all but the finger for each finger, so that the one that touches picks its own; else once.
         scale: unit of the offset, m; about the size of a hand makes outputs of order one.
         hidden: widths of the hidden layers of each MLP.
         separate_heads: an MLP for each output; else all but the finger's share hidden layers.
@@ -41,6 +54,7 @@ class Pose(Representation):
         hand: Hand,
         channels: int,
         *,
+        per_finger: bool = False,
         scale: float = 0.1,
         hidden: Sequence[int] = (128,),
         separate_heads: bool = False,
@@ -62,7 +76,9 @@ class Pose(Representation):
         self.joints = JointBins(hand, bins=bins, shared=shared_bins, by_joint=joint_bins)
         self.told = torch.nonzero(self.joints.count).flatten().tolist()
         self.size = 9 + len(hand.joint_names)
-        sizes = {"offset": 3, "rotation": 6, "joints": 2 * self.joints.most * len(self.told)}
+        self.versions = len(hand.fingers) if per_finger else 1
+        self.shapes = {"offset": (3,), "rotation": (6,), "joints": (len(self.told), 2, self.joints.most)}
+        sizes = {name: self.versions * math.prod(shape) for name, shape in self.shapes.items()}
         self.stage_1 = Heads(channels, {"finger": len(hand.fingers) + 1}, hidden, separate=separate_heads)
         self.stage_2 = Heads(channels, sizes, hidden, separate=separate_heads)
 
@@ -85,17 +101,21 @@ class Pose(Representation):
         finger = prediction["finger"][:, 1:].argmax(-1)
         joint = torch.tensor(self.told, device=points.device).expand(len(points), -1)
         joints = self.joints.lower.to(points).repeat(len(points), 1)
-        logits, residuals = prediction["joints"].unbind(-2)
+        outputs = of_finger(prediction, finger)
+        logits, residuals = outputs["joints"].unbind(-2)
         joints[:, self.told] = self.joints.join(logits, residuals, joint)
-        rotation = _orthonormal(prediction["rotation"])
-        base = geometry.pose(rotation, points + self.scale * prediction["offset"])
+        rotation = _orthonormal(outputs["rotation"])
+        base = geometry.pose(rotation, points + self.scale * outputs["offset"])
         return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0])
 
     def forward(self, features: Float[Tensor, "N C"]) -> Prediction:
-        """Return finger (N, F + 1) logits, offset (N, 3), rotation (N, 6), joints (N, slots, 2, bins)."""
-        told = self.stage_1(features) | self.stage_2(features)
-        told["joints"] = told["joints"].unflatten(-1, (len(self.told), 2, self.joints.most))
-        return told
+        """Return finger (N, F + 1) logits, offset (N, V, 3), rotation (N, V, 6), joints (N, V, slots, 2, bins).
+
+        V is F with `per_finger`, else 1; bins are logits, then residuals.
+        """
+        told = self.stage_2(features)
+        shaped = {name: told[name].unflatten(-1, (self.versions, *shape)) for name, shape in self.shapes.items()}
+        return self.stage_1(features) | shaped
 
     def loss(self, prediction: Prediction, targets: Targets) -> dict[str, Tensor]:
         """Return the terms finger, offset, rotation and joints; all but the first count contact points only."""
@@ -105,10 +125,12 @@ class Pose(Representation):
         )
         truth = targets.parameters[contact]
         joint = torch.tensor(self.told, device=truth.device).expand(len(truth), -1)
-        logits, residuals = prediction["joints"][contact].unbind(-2)
+        rows = {name: value[contact] for name, value in prediction.items()}
+        outputs = of_finger(rows, targets.finger[contact] - 1)
+        logits, residuals = outputs["joints"].unbind(-2)
         joints = self.joints.loss(logits, residuals, truth[:, 9:][:, self.told], joint, huber=self.huber)
-        offset = torch.linalg.vector_norm(prediction["offset"][contact].to(truth) - truth[:, :3], dim=-1)
-        rotation = torch.linalg.vector_norm(prediction["rotation"][contact].to(truth) - truth[:, 3:9], dim=-1)
+        offset = torch.linalg.vector_norm(outputs["offset"].to(truth) - truth[:, :3], dim=-1)
+        rotation = torch.linalg.vector_norm(outputs["rotation"].to(truth) - truth[:, 3:9], dim=-1)
         return {
             "finger": self.alpha * classes,
             "offset": self.beta_offset * mean(offset),
@@ -120,12 +142,13 @@ class Pose(Representation):
         """Return what a perfect network would put out."""
         joint = torch.tensor(self.told, device=targets.finger.device).expand(len(targets), -1)
         angles = targets.parameters[:, 9:][:, self.told]
-        return {
-            "finger": CERTAIN * F.one_hot(targets.finger, len(self.hand.fingers) + 1).to(targets.parameters),
+        outputs = {
             "offset": targets.parameters[:, :3],
             "rotation": targets.parameters[:, 3:9],
             "joints": torch.stack(self.joints.as_prediction(angles, joint), dim=-2),
         }
+        finger = CERTAIN * F.one_hot(targets.finger, len(self.hand.fingers) + 1).to(targets.parameters)
+        return {"finger": finger} | every_finger(outputs, self.versions)
 
 
 def _orthonormal(columns: Float[Tensor, "N 6"]) -> Float[Tensor, "N 3 3"]:
