@@ -1,0 +1,187 @@
+"""Where hands might grasp: candidates with open fingers, before any is closed (METHOD section 4)."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from dexgrasp.contact_frame import place
+from dexgrasp.distance import DistanceField
+from dexgrasp.geometry import inverse
+from dexgrasp.hand import Hand
+from dexgrasp.objects import Object
+
+TRIES = 6
+"""A contact-first candidate is the most promising of this many draws."""
+WANDER = 0.012
+"""How far on the surface a varied grasp's contact may move, m."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What proposals know of an object. Object frame, metres, float64."""
+
+    points: Float[Tensor, "P 3"]
+    """Spread uniformly: at most one in each voxel."""
+    normals: Float[Tensor, "P 3"]
+    center: Float[Tensor, "3"]
+    """Centre of mass."""
+    radius: float
+    field: DistanceField
+
+    @classmethod
+    def sample(cls, item: Object, field: DistanceField, spacing: float, rng: np.random.Generator) -> "Surface":
+        """Sample an object's surface uniformly in voxel space, voxels of `spacing` (m)."""
+        count = int(np.clip(8 * item.mesh.area / spacing**2, 1000, 200_000))
+        points, faces = trimesh.sample.sample_surface(item.mesh, count, seed=int(rng.integers(2**31)))
+        _, first = np.unique(np.floor(points / spacing).astype(np.int64), axis=0, return_index=True)
+        first = rng.permutation(first)
+        return cls(
+            points=torch.from_numpy(np.asarray(points[first])),
+            normals=torch.from_numpy(np.asarray(item.mesh.face_normals[faces[first]])),
+            center=torch.from_numpy(np.asarray(item.com)),
+            radius=item.radius,
+            field=field,
+        )
+
+    def nearest(self, points: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
+        """Return the nearest surface point of each."""
+        return torch.from_numpy(cKDTree(self.points.numpy()).query(points.numpy())[1])
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Fingertip contacts from which hands are placed: what a contact-first proposal varies."""
+
+    point: Int[Tensor, "N"]
+    """Index in the surface."""
+    finger: Int[Tensor, "N"]
+    xy: Float[Tensor, "N 2"]
+    joints: Float[Tensor, "N J"]
+    """Posture when the finger touches; all fingers closed alike."""
+
+    def __getitem__(self, index: Tensor) -> "Contacts":
+        return Contacts(self.point[index], self.finger[index], self.xy[index], self.joints[index])
+
+    @classmethod
+    def cat(cls, parts: "list[Contacts]") -> "Contacts":
+        """Join several."""
+        names = ("point", "finger", "xy", "joints")
+        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+
+
+def opened(hand: Hand, joints: Float[Tensor, "N J"]) -> Float[Tensor, "N J"]:
+    """Return the postures with every closing joint at the limit from which it closes."""
+    result = joints.clone()
+    for finger in hand.fingers:
+        for joint, rate in finger.closing.items():
+            place_ = hand.joint_names.index(joint)
+            result[:, place_] = hand.limits[place_, 0 if rate > 0 else 1].to(joints)
+    return result
+
+
+def approach(
+    hand: Hand, surface: Surface, count: int, rng: np.random.Generator
+) -> tuple[Float[Tensor, "N 4 4"], Float[Tensor, "N J"]]:
+    """Propose hands whose palm looks along a surface normal: depth x in-plane rotation x spread (the paper's way).
+
+    Returns object_T_base and open postures. Depth is the palm's distance from the point, up to the hand's reach.
+    """
+    pick = torch.from_numpy(rng.integers(len(surface.points), size=count))
+    unit = torch.from_numpy(_strata(rng, count, 3))
+    joints = opened(hand, _uniform(hand, rng, count))
+    z = -surface.normals[pick]
+    helper = torch.eye(3, dtype=torch.float64)[z.abs().argmin(dim=1)]
+    x = torch.nn.functional.normalize(torch.linalg.cross(z, helper), dim=1)
+    y = torch.linalg.cross(z, x)
+    roll = 2 * math.pi * unit[:, :1]
+    x = torch.cos(roll) * x + torch.sin(roll) * y
+    object_T_palm = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    object_T_palm[:, :3, :3] = torch.stack([x, torch.linalg.cross(z, x), z], dim=2)
+    depth = 0.005 + (_reach(hand) - 0.005) * unit[:, 1:2]
+    object_T_palm[:, :3, 3] = surface.points[pick] - depth * z
+    return object_T_palm @ inverse(hand.base_T_palm), joints
+
+
+def contact(hand: Hand, surface: Surface, count: int, rng: np.random.Generator) -> Contacts:
+    """Propose hands from one fingertip contact: uniform draws, the most promising of every few kept.
+
+    Promising: the other fingertips, closed alike, come near the surface; the palm is outside; the centre of mass lies
+    between the fingertips.
+    """
+    total = count * TRIES
+    finger = torch.from_numpy(rng.integers(len(hand.fingers), size=total))
+    joints = _uniform(hand, rng, total)
+    _close_alike(hand, joints, torch.from_numpy(rng.uniform(0.15, 0.85, size=total)))
+    # Directions of the finger, uniform on the half sphere over the tangent plane: uniform z.
+    angle, z = rng.uniform(0, 2 * math.pi, total), rng.uniform(0.05, 1, total)
+    xy = torch.from_numpy(np.sqrt(1 - z**2)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    drawn = Contacts(torch.from_numpy(rng.integers(len(surface.points), size=total)), finger, xy, joints)
+    return _best(hand, surface, drawn, count)
+
+
+def varied(hand: Hand, surface: Surface, parents: Contacts, count: int, rng: np.random.Generator) -> Contacts:
+    """Propose variations of contacts that led to grasps: moved on the surface, turned and closed a little."""
+    pick = torch.from_numpy(rng.integers(len(parents.point), size=count))
+    moved = surface.points[parents.point[pick]] + torch.from_numpy(rng.normal(scale=WANDER, size=(count, 3)))
+    point = surface.nearest(moved)
+    span = (hand.limits[:, 1] - hand.limits[:, 0]).clamp(max=math.pi)
+    noise = torch.from_numpy(rng.normal(scale=0.05, size=(count, len(span)))) * span
+    xy = parents.xy[pick] + torch.from_numpy(rng.normal(scale=0.12, size=(count, 2)))
+    xy = xy / torch.linalg.vector_norm(xy, dim=1, keepdim=True).clamp(min=1.0)
+    return Contacts(point, parents.finger[pick], xy, hand.clamp(parents.joints[pick] + noise))
+
+
+def placed(hand: Hand, surface: Surface, contacts: Contacts) -> Float[Tensor, "N 4 4"]:
+    """Return object_T_base of hands that touch as told."""
+    points, normals = surface.points[contacts.point], surface.normals[contacts.point]
+    return place(hand, contacts.finger, points, normals, contacts.xy, contacts.joints)
+
+
+def _best(hand: Hand, surface: Surface, drawn: Contacts, count: int) -> Contacts:
+    pose = placed(hand, surface, drawn)
+    tips = (pose[:, None] @ hand.fingertips(drawn.joints))[..., :3, 3]
+    radius = torch.tensor([finger.tip_radius for finger in hand.fingers], dtype=torch.float64)
+    gaps = torch.as_tensor(surface.field.lower_bound(tips.reshape(-1, 3))).reshape(tips.shape[:2]) - radius
+    palm = (pose @ hand.base_T_palm)[:, :3, 3]
+    buried = torch.as_tensor(surface.field.lower_bound(palm)) < 0.002
+    aside = torch.linalg.vector_norm(tips.mean(dim=1) - surface.center, dim=1)
+    cost = gaps.abs().sum(dim=1) + 0.5 * aside + 10.0 * buried
+    best = cost.reshape(count, TRIES).argmin(dim=1)
+    return drawn[torch.arange(count) * TRIES + best]
+
+
+def _close_alike(hand: Hand, joints: Tensor, part: Tensor) -> None:
+    """Set every closing joint to the same part of its range, in place."""
+    for finger in hand.fingers:
+        for joint, rate in finger.closing.items():
+            index = hand.joint_names.index(joint)
+            low, high = hand.limits[index] if rate > 0 else hand.limits[index].flip(0)
+            joints[:, index] = low + (high - low) * part
+
+
+def _uniform(hand: Hand, rng: np.random.Generator, count: int) -> Tensor:
+    low, high = hand.limits.T
+    return low + (high - low) * torch.from_numpy(rng.uniform(size=(count, len(low))))
+
+
+def _strata(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
+    """Return `count` points of the unit cube, each coordinate stratified."""
+    order = np.stack([rng.permutation(count) for _ in range(size)], axis=1)
+    return (order + rng.uniform(size=(count, size))) / count
+
+
+def _reach(hand: Hand) -> float:
+    """Return how far the fingertips get along the palm's axis with fingers half closed (m)."""
+    middle = hand.limits.mean(dim=1, keepdim=True).T.clone()
+    heights = []
+    for part in np.linspace(0, 1, 9):
+        _close_alike(hand, middle, torch.tensor([part], dtype=torch.float64))
+        tips = inverse(hand.base_T_palm) @ hand.fingertips(middle)[0]
+        heights.append(float(tips[:, 2, 3].max()))
+    return max(heights)

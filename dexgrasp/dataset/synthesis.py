@@ -1,0 +1,211 @@
+"""Objects become grasps: propose, close, judge, thin (METHOD section 4)."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from dexgrasp.closing import MISSES, OFF_TIP, PENETRATES, Closer, close_fingers
+from dexgrasp.collision import HandShape, as_arrays
+from dexgrasp.contact_frame import place, project
+from dexgrasp.dataset.proposals import Contacts, Surface, approach, contact, opened, placed, varied
+from dexgrasp.distance import DistanceField
+from dexgrasp.errors import DexgraspError
+from dexgrasp.execution import pregrasp
+from dexgrasp.geometry import rotation_angle
+from dexgrasp.grasps import Grasps
+from dexgrasp.hand import Hand
+from dexgrasp.objects import Object
+from dexgrasp.quality import epsilon, wrenches
+from dexgrasp.seeds import stream
+
+LEVER = 0.1
+"""Turning the base by an angle counts as moving it by angle x this (m) when the telling finger is chosen."""
+
+
+@dataclass(frozen=True)
+class SynthesisSettings:
+    """How grasps are found and which are kept; see conf/synthesis/default.yaml for units and meaning."""
+
+    friction: float = 0.5
+    edges: int = 8
+    epsilon: float = 0.05
+    penetration: float = 0.001
+    approach: float = 0.3
+    varied: float = 0.5
+    target: int = 2000
+    batch: int = 2048
+    rounds: int = 40
+    spacing: float = 0.003
+    retreat: float = 0.10
+    opening: float = 0.35
+    overlap: float = 0.0005
+    near_position: float = 0.01
+    near_angle: float = 0.2
+    near_joints: float = 0.2
+
+    def __post_init__(self) -> None:
+        if min(self.batch, self.rounds, self.target) < 1 or not 0 <= self.approach + self.varied <= 1:
+            raise DexgraspError(
+                "batch, rounds, target >= 1 and shares that add up to at most 1",
+                f"{self.batch=}, {self.rounds=}, {self.target=}, {self.approach=}, {self.varied=}",
+                "correct the group `synthesis`",
+            )
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What became of the candidates of one object."""
+
+    candidates: int
+    rejected: dict[str, int] = field(default_factory=dict)
+    """By the first check that failed, in order."""
+    valid: int = 0
+    """Passed every check."""
+    kept: int = 0
+    """After thinning and the target."""
+    note: str = ""
+    """Why there are none."""
+
+
+def synthesize(hand: Hand, item: Object, settings: SynthesisSettings, seed: int) -> tuple[Grasps, Summary]:
+    """Return grasps of one object in its own frame (float64), best spread first, and what became of the candidates.
+
+    Every finger touches with its tip, nothing overlaps by more than `penetration`, epsilon is at least
+    `settings.epsilon`, and hand and object stay apart on the straight way back with the fingers opened. `finger` is
+    the one whose contact tells the pose best (METHOD section 1). The same seed gives the same grasps.
+    """
+    body = DistanceField.build(item.mesh)
+    surface = Surface.sample(item, body, settings.spacing, stream(seed, "surface", item.name))
+    search = _Search(hand, item, surface, settings)
+    for number in range(settings.rounds):
+        search.round(stream(seed, "synthesis", item.name, number))
+        if len(search.grasps) >= settings.target:
+            break
+    grasps = _spread(search.grasps, settings.target)
+    return grasps, Summary(search.candidates, dict(search.rejected), search.valid, len(grasps), search.note())
+
+
+class _Search:
+    def __init__(self, hand: Hand, item: Object, surface: Surface, settings: SynthesisSettings) -> None:
+        self.hand, self.item, self.surface, self.settings = hand, item, surface, settings
+        self.closer, self.shape = Closer(hand), HandShape(hand)
+        self.rejected: Counter[str] = Counter()
+        self.candidates = self.valid = 0
+        self.grasps = Grasps.build(
+            torch.zeros(0, 4, 4).double(), torch.zeros(0, len(hand.joint_names)).double(), len(hand.fingers)
+        )
+        self.contacts: Contacts | None = None
+        """The proposals, as fingertip contacts, of `grasps`."""
+
+    def round(self, rng: np.random.Generator) -> None:
+        """Propose one batch and keep what is valid and new."""
+        settings = self.settings
+        count = round(settings.batch * settings.approach)
+        further = round(settings.batch * settings.varied) if self.contacts is not None else 0
+        pose, joints = approach(self.hand, self.surface, count, rng)
+        told = [contact(self.hand, self.surface, settings.batch - count - further, rng)]
+        if self.contacts is not None and further:
+            told.append(varied(self.hand, self.surface, self.contacts, further, rng))
+        contacts = Contacts.cat(told)
+        pose = torch.cat([pose, placed(self.hand, self.surface, contacts)])
+        joints = torch.cat([joints, opened(self.hand, contacts.joints)])
+        grasps = self._judge(pose, joints)
+        if len(grasps):
+            self._keep(grasps)
+
+    def _judge(self, pose: Float[Tensor, "N 4 4"], start: Float[Tensor, "N J"]) -> Grasps:
+        settings, body = self.settings, self.closer.body
+        self.candidates += len(pose)
+        status, full, touches, _, _ = close_fingers(
+            body, self.surface.field.field, *as_arrays(pose, start), False, True, settings.penetration
+        )
+        for code, reason in ((PENETRATES, "penetrates"), (MISSES, "finger misses"), (OFF_TIP, "touches off the tip")):
+            self.rejected[reason] += int((status == code).sum())
+        good = np.flatnonzero(status == 0)
+        contacts, normals = touches[good, :, :3], touches[good, :, 3:]
+        cones = wrenches(contacts, normals, self.item.com, self.item.radius, settings.friction, settings.edges)
+        quality = epsilon(cones, settings.epsilon)
+        grasps = Grasps.build(pose[good], torch.from_numpy(full[good][:, body.leaders]), contacts.shape[1])
+        grasps = grasps.replace(
+            contacts=torch.from_numpy(contacts), normals=torch.from_numpy(normals), quality=torch.from_numpy(quality)
+        )
+        grasps = self._drop(grasps, grasps.quality >= settings.epsilon, "quality")
+        _, waiting = pregrasp(self.hand, grasps, settings.retreat, settings.opening)
+        folded = self.shape.self_collision(grasps.joints) | self.shape.self_collision(waiting)
+        grasps, waiting = self._drop(grasps, ~folded, "hand touches itself"), waiting[~folded]
+        clear = self.shape.approach_clear(self.surface.field, grasps.pose, waiting, settings.retreat, settings.overlap)
+        grasps = self._drop(grasps, clear, "way is blocked")
+        self.valid += len(grasps)
+        return grasps
+
+    def _drop(self, grasps: Grasps, good: Bool[Tensor, "N"], reason: str) -> Grasps:
+        self.rejected[reason] += int((~good).sum())
+        return grasps[good]
+
+    def _keep(self, grasps: Grasps) -> None:
+        told, contacts = tell(self.hand, self.surface, grasps)
+        both = Grasps.cat([self.grasps, told])
+        known = contacts if self.contacts is None else Contacts.cat([self.contacts, contacts])
+        first = _distinct(both, self.hand, self.settings)
+        self.grasps, self.contacts = both[first], known[first]
+
+    def note(self) -> str:
+        if len(self.grasps):
+            return ""
+        reasons = ", ".join(f"{reason}: {count}" for reason, count in self.rejected.most_common() if count)
+        return f"none of {self.candidates} candidates on {self.item.name} is a grasp ({reasons})"
+
+
+def tell(hand: Hand, surface: Surface, grasps: Grasps) -> tuple[Grasps, Contacts]:
+    """Choose for each grasp the finger whose contact tells its pose best; return it told so, and those contacts."""
+    best = torch.full((len(grasps),), torch.inf, dtype=torch.float64)
+    finger = grasps.finger.clone()
+    chosen = grasps.pose.new_zeros(len(grasps), 2)
+    for number in range(len(hand.fingers)):
+        which = torch.full((len(grasps),), number)
+        points, normals = grasps.contacts[:, number], grasps.normals[:, number]
+        xy, known = project(hand, which, points, normals, grasps.pose, grasps.joints)
+        back = place(hand, which, points, normals, xy, grasps.joints)
+        moved = torch.linalg.vector_norm((back - grasps.pose)[:, :3, 3], dim=1)
+        error = moved + LEVER * rotation_angle(back[:, :3, :3], grasps.pose[:, :3, :3])
+        error = torch.where(known, error, torch.inf)
+        better = error < best
+        best, finger = torch.where(better, error, best), torch.where(better, which, finger)
+        chosen = torch.where(better[:, None], xy, chosen)
+    finger = finger.clamp(min=0)
+    points = grasps.contacts[torch.arange(len(grasps)), finger]
+    return grasps.replace(finger=finger), Contacts(surface.nearest(points), finger, chosen, grasps.joints)
+
+
+def _distinct(grasps: Grasps, hand: Hand, settings: SynthesisSettings) -> Int[Tensor, "K"]:
+    """Return the best grasp of each cell of palm position x palm axes x joints, in order of discovery."""
+    palm = grasps.pose @ hand.base_T_palm
+    cells = torch.cat(
+        [
+            (palm[:, :3, 3] / settings.near_position).floor(),
+            (palm[:, :3, [0, 2]].flatten(1) / settings.near_angle).floor(),
+            (grasps.joints / settings.near_joints).floor(),
+        ],
+        dim=1,
+    ).long()
+    order = torch.argsort(grasps.quality, descending=True, stable=True)
+    _, first = np.unique(cells[order].numpy(), axis=0, return_index=True)
+    return order[torch.from_numpy(first)].sort().values
+
+
+def _spread(grasps: Grasps, target: int) -> Grasps:
+    """Order grasps so that every part of the object and every direction comes first once, its best grasp first."""
+    if not len(grasps):
+        return grasps
+    axes = torch.cat([grasps.contacts.mean(dim=1) / 0.015, grasps.pose[:, :3, 2] / 0.5], dim=1).floor().long()
+    _, cell = np.unique(axes.numpy(), axis=0, return_inverse=True)
+    order = np.lexsort((-grasps.quality.numpy(), cell.reshape(-1)))
+    sorted_cells = cell.reshape(-1)[order]
+    starts = np.flatnonzero(np.r_[True, sorted_cells[1:] != sorted_cells[:-1]])
+    rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
+    final = order[np.lexsort((-grasps.quality.numpy()[order], rank))]
+    return grasps[torch.from_numpy(final[:target].copy())]
