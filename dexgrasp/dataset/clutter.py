@@ -140,7 +140,7 @@ def feasible(
     """Tell which grasps (world frame, `object` counts the rows of `poses`) are clear of table and neighbours.
 
     The closed hand at the grasp and the opened hand along the whole approach. `poses` is world_T_object; own object
-    and self-collision are `approachable`'s matter.
+    and self-collision are `approachable`'s matter, and synthesis has seen to them.
     """
     ready, opened = pregrasp(hand, grasps, approach.retreat, approach.opening)
     # Height is linear along a straight line without turning: the two ends suffice.
@@ -153,6 +153,23 @@ def feasible(
         for joints, way in ((grasps.joints, 0.0), (opened, approach.retreat)):
             rows = (free & (grasps.object != number)).nonzero().flatten()
             free[rows] = shape.approach_clear(field, object_T_base[rows], joints[rows], way, -approach.neighbour)
+    return free
+
+
+def clear(
+    shape: HandShape,
+    hand: Hand,
+    grasps: Grasps,
+    poses: Float[Tensor, "O 4 4"],
+    fields: Sequence[DistanceField],
+    approach: Approach,
+) -> Bool[Tensor, "N"]:
+    """Tell which grasps are `feasible` in the scene and `approachable` on their own object (world frame)."""
+    free = feasible(shape, hand, grasps, poses, fields, approach)
+    for number, field in enumerate(fields):
+        rows = (free & (grasps.object == number)).nonzero().flatten()
+        own = grasps[rows].moved(inverse(poses[number]))
+        free[rows] = approachable(shape, hand, field, own, approach)
     return free
 
 

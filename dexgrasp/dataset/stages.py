@@ -5,9 +5,10 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from dexgrasp.dataset.camera import Viewpoints
-from dexgrasp.dataset.clutter import Approach, Clutter, approachable, build_scene, feasible
+from dexgrasp.dataset.clutter import Approach, Clutter, build_scene, clear, feasible
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.labels import LabelSettings, label
 from dexgrasp.dataset.sensor import Framing, Sensor, capture
@@ -15,6 +16,7 @@ from dexgrasp.dataset.store import Item
 from dexgrasp.dataset.synthesis import SynthesisSettings, synthesize
 from dexgrasp.dataset.truth import Truth, TruthSettings
 from dexgrasp.errors import DexgraspError
+from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
 from dexgrasp.objects import Object, object_to_tensors
 from dexgrasp.plugins import build_representation
@@ -33,12 +35,11 @@ def make_object(index: int, item: Object) -> Item:
 
 
 def make_grasps(dataset: Dataset, index: int) -> Item:
-    """Synthesise the grasps of object `index` and keep those that the hand can reach."""
+    """Synthesise the grasps of object `index`."""
     settings, item = Settings.read(dataset.config), dataset.objects[index]
     grasps, summary = synthesize(dataset.hand, item, settings.synthesis, dataset.config["seed"])
-    free = approachable(dataset.shape, dataset.hand, dataset.field(index), grasps, settings.approach)
-    facts = {"name": item.name, "found": len(grasps), "kept": int(free.sum()), "summary": vars(summary)}
-    return Item(key(index), grasps[free].to(torch.float32).tensors(), facts)
+    facts = {"name": item.name, "kept": len(grasps), "summary": vars(summary)}
+    return Item(key(index), grasps.to(torch.float32).tensors(), facts)
 
 
 def make_scene(dataset: Dataset, index: int) -> Item:
@@ -93,9 +94,15 @@ def make_labels(dataset: Dataset, index: int) -> Item:
     settings = Settings.read(dataset.config)
     view, grasps = dataset.view(index), dataset.view_grasps(index)
     number = dataset.scene_of(index)
-    poses = view.world_T_camera.double().inverse() @ dataset.scene(number).poses
+    scene, world_T_camera = dataset.scene(number), view.world_T_camera.double()
     bodies = [dataset.body(i) for i in dataset.scene_objects(number).tolist()]
-    truth = Truth(dataset.closer, bodies, poses, settings.truth)
+    obstacles = [body.field for body in bodies]
+
+    def is_clear(told: Grasps) -> Tensor:
+        world = told.to(torch.float64).moved(world_T_camera)
+        return clear(dataset.shape, dataset.hand, world, scene.poses, obstacles, settings.approach)
+
+    truth = Truth(dataset.closer, bodies, inverse(world_T_camera) @ scene.poses, settings.truth, is_clear)
     representation = build_representation(dataset.representation, dataset.hand, channels=1)
     found = label(view, grasps, representation, truth.holds, settings.points)
     facts = {"points": len(found), "true": int(found.true.sum()), "grasps": len(grasps)}
