@@ -150,3 +150,20 @@ def test_authors_sizes_run():
     ).eval()
     with torch.no_grad():
         assert net(data)[0].shape == (1, 2048, 256)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@VARIANTS
+def test_cuda_gives_what_the_cpu_gives(factorised):
+    net, data = network(factorised=factorised), cloud()
+    features, seeds = net(data)
+    (features**2).mean().backward()
+    gradients = [parameter.grad.clone() for parameter in net.parameters()]
+    net.zero_grad()
+    there, same = net.cuda()(data.cuda())
+    (there**2).mean().backward()
+    assert torch.equal(same.cpu(), seeds)
+    torch.testing.assert_close(there.cpu(), features, atol=1e-4, rtol=1e-3)
+    for parameter, expected in zip(net.parameters(), gradients, strict=True):
+        torch.testing.assert_close(parameter.grad.cpu(), expected, atol=1e-4, rtol=1e-2)
