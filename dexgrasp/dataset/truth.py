@@ -27,9 +27,9 @@ Clear = Callable[[Grasps], Bool[Tensor, "N"]]
 class TruthSettings:
     """What must hold of a grasp that is told."""
 
-    distance: float = 0.03
+    distance: float = 0.05
     """Farthest that the base may have moved from the original, m; farther is not tried."""
-    angle: float = math.radians(25)
+    angle: float = math.radians(45)
     """Farthest that it may have turned, rad."""
     close: bool = True
     """Close the fingers again and test what they touch; else distance and angle decide alone."""
