@@ -75,6 +75,7 @@ def pipeline(command: str, arguments: list[str]) -> int:
     import hydra
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
 
     from dexgrasp import config, overrides
 
@@ -85,7 +86,7 @@ def pipeline(command: str, arguments: list[str]) -> int:
     start = hydra.main(version_base="1.3", config_path=str(config.conf_folder()), config_name=command)
     try:
         start(config.Task(command))()
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
         if full:
             raise
         raise overrides.explain(error, command, [word for word in arguments if not word.startswith("-")]) from error

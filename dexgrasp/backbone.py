@@ -24,7 +24,9 @@ class Backbone(nn.Module, ABC):
         """
 
     @abstractmethod
-    def forward(self, cloud: Float[Tensor, "B N 6"], plan: Plan | None = None) -> tuple[Float[Tensor, "B M C"], Int[Tensor, "B M"]]:
+    def forward(
+        self, cloud: Float[Tensor, "B N 6"], plan: Plan | None = None
+    ) -> tuple[Float[Tensor, "B M C"], Int[Tensor, "B M"]]:
         """Return features and the indices of the seed points they belong to.
 
         `cloud` is position (m, any frame) and unit normal; `plan` is the stacked plans of the batch, made here

@@ -8,6 +8,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from yaml import YAMLError
 
 from dexgrasp.config import conf_folder
 from dexgrasp.errors import DexgraspError
@@ -26,6 +27,8 @@ def explain(error: Exception, command: str, overrides: list[str]) -> DexgraspErr
         return unknown(group or "config", name.removesuffix(".yaml"), sorted(error.options))
     if isinstance(error, OverrideParseException):
         return DexgraspError("overrides as key=value", repr(error.override), f"quote it for the shell: {error.message}")
+    if isinstance(error, YAMLError):
+        return DexgraspError("configs in YAML", " ".join(str(error).split()), "correct that file")
     if isinstance(error, MissingMandatoryValue):
         key = getattr(error, "full_key", None) or "a value"
         return DexgraspError(f"a value for {key}", "none", f"give it: {key}=...")

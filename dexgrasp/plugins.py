@@ -148,8 +148,9 @@ def unknown(kind: str, name: str, known: list[str]) -> DexgraspError:
 
 
 def conf_folders() -> list[tuple[str, Path]]:
-    """Return (top-level package, its config folder) of every plugin that has one; nothing is imported."""
-    packages = sorted({_package(entry) for kind in GROUPS for entry in _entries(kind)})
+    """Return (top-level package, its config folder) of every plugin that has one, ours first; nothing is imported."""
+    order = {(_distribution(entry) != "dexgrasp", _package(entry)) for kind in GROUPS for entry in _entries(kind)}
+    packages = dict.fromkeys(package for _, package in sorted(order))
     return [(package, folder) for package in packages if (folder := conf_folder(package)) is not None]
 
 

@@ -186,6 +186,15 @@ def test_a_hand_in_a_plain_folder_is_a_choice(command):
     )
 
 
+def test_a_yaml_that_is_none_breaks_only_its_own_choice(command):
+    folder = command.folder / "mine"
+    (folder / "hand").mkdir(parents=True)
+    (folder / "hand/mine.yaml").write_text("name: [mine\n")
+    status, _, err = command("--config-dir", str(folder), "hand=mine")
+    assert status == 2 and "mine.yaml" in err and "Traceback" not in err
+    assert command("--config-dir", str(folder), "hand=barrett")[0] == 0
+
+
 def plugins_choices(kind):
     return {path.stem for _, folder in plugins.conf_folders() for path in (folder / kind).glob("*.yaml")}
 

@@ -254,6 +254,13 @@ def test_packages_are_found_without_importing(package):
     assert plugins.package_folder("dexgrasp_nowhere") is None and plugins.package_folder("dexgrasp_theirs.no") is None
 
 
+def test_our_configs_come_before_a_strangers(registry, package):
+    package("aaa_theirs", {"__init__.py": "", "conf/hand/barrett.yaml": "name: barrett\nurdf: nowhere\n"})
+    registry(entry("hand", "theirs", "aaa_theirs"))
+    found = [name for name, _ in plugins.conf_folders()]
+    assert found[-1] == "aaa_theirs" and len(found) == len(set(found))
+
+
 def test_the_one_exception_survives_a_worker():
     error = pickle.loads(pickle.dumps(DexgraspError("a", "b", "c")))
     assert (error.expected, error.found, error.remedy) == ("a", "b", "c")
