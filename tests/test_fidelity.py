@@ -3,6 +3,8 @@
 import csv
 import json
 import math
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -129,3 +131,27 @@ def test_nothing_to_tell_is_a_row_too(contact, toy_hand):
     every, chosen = fidelity.rows("contact", "true", found, checked=True)
     assert every.count == chosen.count == 0 and every.encodable == 0
     assert every.distance_mm["p50"] is None and fidelity.cells(every)[-1] == "-"
+
+
+def test_the_command_measures_every_representation(tmp_path):
+    arguments = [
+        *("dataset=smoke", "dataset.workers=1", "dataset.backend=threading", "dataset.objects.count=2"),
+        *("dataset.scenes.count=1", "dataset.scenes.counts=[1]", "dataset.synthesis.rounds=1"),
+        *(
+            "grasps_per_object=10",
+            "pairs_per_view=20",
+            f"dataset.root={tmp_path}/data",
+            f"hydra.run.dir={tmp_path}/run",
+        ),
+    ]
+    command = [sys.executable, "-m", "dexgrasp", "fidelity", *arguments]
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=280)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.splitlines()[-1] == f"{tmp_path}/run"
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    told = {(row["representation"], row["normals"], row["told_from"]): row for row in results["rows"]}
+    assert {key[0] for key in told} >= {"contact", "pose"} and len(told) >= 8
+    pose, contact = told["pose", "true", "any"], told["contact", "true", "any"]
+    assert pose["count"] == contact["count"] > 0
+    assert pose["truthful"] == 1 and pose["distance_mm"]["p95"] < 1e-6 < contact["distance_mm"]["p95"]
+    assert "contact" in run.stdout and "deg p50" in run.stdout
