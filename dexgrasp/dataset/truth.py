@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,12 +46,12 @@ class TruthSettings:
     edges: int = 8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Body:
     """An object as the closing hand meets it."""
 
     field: DistanceField
-    com: np.ndarray = field(repr=False)
+    com: np.ndarray
     """Centre of mass in object coordinates, m."""
     radius: float
     """Torque scale: largest distance from it to the surface, m."""
@@ -118,5 +118,5 @@ class Truth:
         if good.any():
             contacts, normals = closure.contacts[good].double(), closure.normals[good].double()
             cones = wrenches(contacts, normals, body.com, body.radius, limits.friction, limits.edges)
-            quality[good] = epsilon(cones, threshold=limits.epsilon).to(quality)
+            quality[good] = torch.as_tensor(epsilon(cones, threshold=limits.epsilon)).to(quality)
         return quality
