@@ -153,12 +153,32 @@ def test_downsample_fills_up_from_the_other_side() -> None:
     plane = np.c_[generator.uniform(-1, 1, (900, 2)), np.zeros(900)]
     rest = generator.uniform(0.1, 0.5, (100, 3))
     cloud = np.concatenate([plane, rest])
-    assert dominant_plane(cloud, 0.004, generator)[:900].all()
+    cloud[:, 2] = 2 - cloud[:, 2]  # seen from above
+    heights, places = dominant_plane(cloud, 0.004, generator)
+    assert np.abs(heights[:900]).max() < 1e-9 and (heights[900:] > 0.09).all() and places.shape == (1000, 2)
     for count in (32, 500, 950, 1000, 1500):
-        chosen = downsample(cloud, Framing(points=count), stream(1, "draw"))
+        chosen = downsample(cloud, Framing(points=count, plane_margin=np.inf), stream(1, "draw"))
         assert len(chosen) == count and chosen.min() >= 0 and chosen.max() < 1000
         assert len(np.unique(chosen)) == min(count, 1000)
-    assert (downsample(cloud, Framing(points=100), stream(1, "draw")) >= 900).sum() == 75
+    assert (downsample(cloud, Framing(points=100, plane_margin=np.inf), stream(1, "draw")) >= 900).sum() == 75
+
+
+def test_only_the_surroundings_of_things_are_kept_of_a_table() -> None:
+    meshes, poses = box_and_ball()
+    pose = look_at(torch.tensor([0.3, -0.4, 0.5]), torch.tensor([0.0, 0.0, 0.03]))
+    view = capture(meshes, poses, pose, Sensor(CAMERA), Framing(points=4096), stream(0, "n"))
+    world = view.points @ view.world_T_camera[:3, :3].T + view.world_T_camera[:3, 3]
+    table, things = world[view.instance < 0], world[view.instance >= 0]
+    high = things[things[:, 2] > 0.01]
+    assert torch.cdist(table[:, :2], high[:, :2]).min(dim=1).values.max() < 0.04
+    kept = capture(meshes, poses, pose, Sensor(CAMERA), Framing(points=4096, plane_margin=np.inf), stream(0, "n"))
+    assert kept.points.var(dim=0).sum() > 1.3 * view.points.var(dim=0).sum()
+    # A wide box that hides most of the table: its top is the dominant plane, and stays.
+    top = [trimesh.creation.box([0.3, 0.3, 0.1])]
+    down = look_at(torch.tensor([0.0, 0.0, 0.7]), torch.tensor([0.0, 0.0, 0.0]))
+    view = capture(top, torch.stack([at(0, 0, 0.05)]), down, Sensor(CAMERA), Framing(points=2048), stream(0, "n"))
+    middle = (view.points[:, :2].abs() < 0.05).all(dim=1) & (view.instance == 0)
+    assert middle.sum() > 20
 
 
 def test_too_little_to_see_is_an_error() -> None:
