@@ -1,0 +1,33 @@
+"""How a grasp is carried out: where the hand waits before it."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dexgrasp.geometry import inverse
+from dexgrasp.grasps import Grasps
+from dexgrasp.hand import Hand
+
+
+def pregrasp(
+    hand: Hand, grasps: Grasps, retreat: float = 0.10, opening: float = 0.35
+) -> tuple[Float[Tensor, "N 4 4"], Float[Tensor, "N J"]]:
+    """Return frame_T_base and joints from which a straight line leads to each grasp.
+
+    The base stands back by `retreat` (m) against the palm's approach direction; every joint that closes a finger is
+    opened by `opening` (rad, or m where prismatic) as far as its limit allows. Other joints are the grasp's.
+    """
+    back = torch.eye(4, dtype=grasps.pose.dtype, device=grasps.pose.device)
+    back[2, 3] = -retreat
+    base_T_palm = hand.base_T_palm.to(grasps.pose)
+    pose = grasps.pose @ base_T_palm @ back @ inverse(base_T_palm)
+    return pose, hand.clamp(grasps.joints - opening * closing_direction(hand).to(grasps.joints))
+
+
+def closing_direction(hand: Hand) -> Float[Tensor, "J"]:
+    """Return, per independent joint, +1 or -1 where moving that way closes fingers, 0 where it closes none."""
+    direction = torch.zeros(len(hand.joint_names), dtype=torch.float64)
+    for finger in hand.fingers:
+        for joint, rate in finger.closing.items():
+            direction[hand.joint_names.index(joint)] = (rate > 0) - (rate < 0)
+    return direction

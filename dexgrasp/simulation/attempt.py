@@ -1,0 +1,190 @@
+"""One attempt: approach, close, squeeze, lift, hold, and the verdict on it."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from dexgrasp.grasps import Reason
+from dexgrasp.simulation.protocol import Protocol
+from dexgrasp.simulation.world import World
+
+Array = NDArray[np.float64]
+
+CHECK = 10
+"""Time steps between two looks at the state."""
+LOST = 5
+"""Looks without any touch after which an object counts as lost."""
+TOUCHED_AGAINST_TABLE = 0.01
+"""Rise from which an object has left the table, m."""
+MOVED = 0.02
+"""Displacement from which a hand that holds nothing has pushed an object away, m."""
+STALLED = 0.02
+"""Joint speed below which a closing joint stands still, rad/s or m/s."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """The verdict on one attempt, see `Outcomes`."""
+
+    reason: Reason
+    object: int
+    height: float
+    final: Array
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Where the hand goes: world_T_base (4, 4) and joints (J,) before and at the grasp."""
+
+    start_pose: Array
+    start_joints: Array
+    pose: Array
+    joints: Array
+    direction: Array
+    """(J,) +1 or -1 where moving that way closes fingers, else 0."""
+
+
+class Attempt:
+    """Carries one plan out in a world, from the initial `poses` (O, 4, 4) of its objects."""
+
+    def __init__(self, world: World, poses: Array, plan: Plan, protocol: Protocol, target: int = -1) -> None:
+        self.world, self.plan, self.protocol, self.target = world, plan, protocol, target
+        self.model, self.data = world.model, world.data
+        self.efforts = world.hand.efforts.numpy()  # type: ignore[union-attr]
+        self.limits = world.hand.limits.numpy()  # type: ignore[union-attr]
+        world.reset(poses)
+        self._effort(1.0)
+        world.place_hand(plan.start_pose, plan.start_joints)
+        self.initial = world.centres().copy()
+        self.first = -1
+        self.highest = np.zeros(len(self.initial))
+
+    def run(self) -> Result:
+        """Return the verdict; stops as soon as it is known."""
+        if self.world.intrusion() > self.protocol.verdict.intrusion:
+            return self._result(Reason.COLLIDED)
+        if not self._approach():
+            return self._result(Reason.COLLIDED)
+        self._close()
+        if not self.world.touched().any():
+            return self._result(self._nothing_held())
+        lost = self._lift()
+        return self._result(self._nothing_held() if lost else self._verdict())
+
+    def _approach(self) -> bool:
+        motion, verdict = self.protocol.motion, self.protocol.verdict
+        steps = self._steps(motion.approach_time)
+        for step in range(steps + self._steps(0.05)):
+            share = min((step + 1) / steps, 1.0)
+            self.data.mocap_pos[0] = self.plan.start_pose[:3, 3] + share * (
+                self.plan.pose[:3, 3] - self.plan.start_pose[:3, 3]
+            )
+            # The fingers keep still: they close only when the palm has arrived.
+            mujoco.mj_step(self.model, self.data)
+            if step % CHECK == 0:
+                self._look()
+                if self._displaced().max(initial=0.0) > verdict.displaced:
+                    return False
+        return bool(np.linalg.norm(self.world.base() - self.plan.pose[:3, 3]) <= verdict.blocked)
+
+    def _close(self) -> None:
+        motion = self.protocol.motion
+        self._effort(motion.closing_effort)
+        way = self.plan.joints - self.plan.start_joints
+        closing = self.plan.direction != 0
+        steps = max(self._steps(float(np.abs(way).max(initial=0.0)) / motion.closing_speed), 1)
+        beyond = motion.overdrive if motion.overdrive is not None else np.inf
+        speed = motion.closing_speed * self.protocol.physics.timestep
+        for step in range(steps + self._steps(motion.closing_time)):
+            if step < steps:
+                goal = self.plan.start_joints + (step + 1) / steps * way
+            else:
+                goal = self.plan.joints + self.plan.direction * min((step + 1 - steps) * speed, beyond)
+            self.data.ctrl[:] = np.clip(goal, self.limits[:, 0], self.limits[:, 1])
+            mujoco.mj_step(self.model, self.data)
+            if step % CHECK == 0:
+                self._look()
+                driven = np.abs(self.data.ctrl - self.data.qpos[self.world.driver_qpos])
+                pushing = driven >= motion.closing_effort * self.protocol.physics.servo_error
+                ended = np.isclose(self.data.ctrl, self.limits[:, 1]) | np.isclose(self.data.ctrl, self.limits[:, 0])
+                still = np.abs(self.data.qvel[self.world.driver_qvel]) < STALLED
+                done = (still & (pushing | ended))[closing].all()
+                if step >= steps and (done or (step + 1 - steps) * speed > beyond):
+                    break
+        if motion.overdrive is None:
+            # From here on the servos pull as hard as they can, wherever the fingers stand.
+            reach = self.plan.direction * 4 * self.protocol.physics.servo_error
+            held = self.data.qpos[self.world.driver_qpos] + reach
+            self.data.ctrl[closing] = np.clip(held, self.limits[:, 0], self.limits[:, 1])[closing]
+        steps = self._steps(motion.squeeze_time)
+        for step in range(steps):
+            share = motion.closing_effort + (1 - motion.closing_effort) * (step + 1) / steps
+            self._effort(share)
+            mujoco.mj_step(self.model, self.data)
+            if step % CHECK == 0:
+                self._look()
+        self._effort(1.0)
+
+    def _lift(self) -> bool:
+        """Return True when the hand lost everything on the way."""
+        motion = self.protocol.motion
+        steps, total = self._steps(motion.lift_time), self._steps(motion.lift_time + motion.hold)
+        untouched = 0
+        for step in range(total):
+            share = min((step + 1) / steps, 1.0)
+            height = motion.lift * (0.5 - 0.5 * np.cos(np.pi * share))
+            self.data.mocap_pos[0, 2] = self.plan.pose[2, 3] + height
+            mujoco.mj_step(self.model, self.data)
+            if step % CHECK == 0:
+                untouched = 0 if self._look() else untouched + 1
+                if untouched >= LOST:
+                    return True
+        return False
+
+    def _look(self) -> bool:
+        """Note what is touched and how high it is; return whether the hand touches anything."""
+        touched = self.world.touched()
+        if self.first < 0 and touched.any():
+            self.first = int(np.argmax(touched))
+        self.highest = np.maximum(self.highest, self._rise())
+        return bool(touched.any())
+
+    def _rise(self) -> Array:
+        return self.world.centres()[:, 2] - self.initial[:, 2]
+
+    def _displaced(self) -> Array:
+        return np.linalg.norm(self.world.centres() - self.initial, axis=1) * self.world.present
+
+    def _nothing_held(self) -> Reason:
+        if self.highest.max(initial=0.0) > TOUCHED_AGAINST_TABLE:
+            return Reason.SLIPPED
+        return Reason.TOPPLED if self._displaced().max(initial=0.0) > MOVED else Reason.MISSED
+
+    def _verdict(self) -> Reason:
+        verdict = self.protocol.verdict
+        lifted = (self._rise() >= verdict.rise) & self.world.present
+        if not verdict.exclusive:
+            return Reason.SUCCESS if lifted.any() else self._nothing_held()
+        held = lifted & self.world.touched()
+        if not held.any():
+            return self._nothing_held()
+        if (self._rise() >= 0.5 * verdict.rise).sum() > 1:
+            return Reason.MULTIPLE
+        if self.target >= 0 and not held[self.target]:
+            return Reason.MISSED
+        return Reason.SUCCESS
+
+    def _result(self, reason: Reason) -> Result:
+        rise = self._rise()
+        highest = int(np.argmax(rise)) if len(rise) else -1
+        number = highest if highest >= 0 and rise[highest] > TOUCHED_AGAINST_TABLE else self.first
+        return Result(reason, number, float(rise[number]) if number >= 0 else 0.0, self.world.poses())
+
+    def _effort(self, share: float) -> None:
+        self.model.actuator_forcerange[:, 0] = -share * self.efforts
+        self.model.actuator_forcerange[:, 1] = share * self.efforts
+
+    def _steps(self, time: float) -> int:
+        return round(time / self.protocol.physics.timestep)

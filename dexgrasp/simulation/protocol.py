@@ -1,0 +1,158 @@
+"""Evaluation protocols: every number that decides whether a grasp holds, under a name and a version."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import yaml
+
+from dexgrasp.errors import DexgraspError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Physics:
+    """World and solver."""
+
+    friction: float
+    """Sliding friction of every contact."""
+    torsional_friction: float
+    """Friction about the contact normal, m."""
+    rolling_friction: float
+    """Resistance to rolling on the table, m; without it balls never rest."""
+    density: float
+    """Objects' density, kg/m3."""
+    mass_min: float
+    """kg; equal limits fix the mass."""
+    mass_max: float
+    gravity: float
+    """m/s2, downwards."""
+    timestep: float
+    """s."""
+    impratio: float
+    """Ratio of frictional to normal constraint impedance: higher, less creep."""
+    contact_time: float
+    """Time constant of contacts, couplings and joint limits, s (at least two time steps)."""
+    wrist_time: float
+    """Time constant of the spring that carries the hand's base, s."""
+    servo_error: float
+    """Position error at which a joint's servo reaches its effort limit, rad or m."""
+    armature: float
+    """Reflected rotor inertia of each movable joint, kg m2 or kg."""
+    table_radius: float
+    """An object whose frame leaves this radius has left the table, m."""
+    rest_speed: float
+    """Below this an object rests (m/s; rad/s times 10)."""
+    settle_time: float
+    """Longest time to come to rest, s."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The attempt: approach, close, lift, hold."""
+
+    retreat: float
+    """Length of the straight approach, m."""
+    opening: float
+    """Closing joints open by this much before the grasp, rad or m."""
+    approach_time: float
+    """s."""
+    closing_speed: float
+    """rad/s or m/s of the joint with the longest way; all joints reach the grasp's angles together."""
+    overdrive: float | None
+    """How far closing joints are driven past the grasp's angles, rad or m; None: until they stall."""
+    closing_effort: float
+    """Share of the effort limit while the fingers search for contact; then it rises to all of it."""
+    closing_time: float
+    """Longest time to close after the grasp's angles were reached, s."""
+    squeeze_time: float
+    """Time to raise the effort to its limit, s."""
+    lift: float
+    """m."""
+    lift_time: float
+    """s."""
+    hold: float
+    """s."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What counts as what."""
+
+    rise: float
+    """An object that rose by this much at the end was lifted, m."""
+    exclusive: bool
+    """Whether the hand must hold that object, and only that one."""
+    displaced: float
+    """Object moved by this much before closing: collided, m."""
+    blocked: float
+    """Base short of its goal by this much before closing: collided, m."""
+    intrusion: float
+    """Hand inside table or object by this much at the start: collided, m."""
+    max_tilt: float | None
+    """Grasps that approach more than this off straight down are skipped, degrees."""
+    stop_at: int
+    """A clutter round ends when this many objects are left."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """A named, versioned set of rules (METHOD section 5); every reported number carries `str(protocol)`."""
+
+    name: str
+    version: int
+    physics: Physics
+    motion: Motion
+    verdict: Verdict
+
+    def __str__(self) -> str:
+        return f"{self.name} (version {self.version})"
+
+
+def load_protocol(config: str | Mapping[str, Any]) -> Protocol:
+    """Return a protocol from its name in `conf/protocol` or from a composed config.
+
+    Raises:
+        DexgraspError: an unknown protocol, an unknown or missing key, or a value of the wrong type.
+    """
+    if isinstance(config, str):
+        from dexgrasp.config import conf_folder
+
+        folder = conf_folder() / "protocol"
+        path = folder / f"{config}.yaml"
+        if not path.is_file():
+            known = ", ".join(sorted(file.stem for file in folder.glob("*.yaml")))
+            raise DexgraspError(f"a protocol: {known}", repr(config), f"correct the name, or write {path}")
+        config = yaml.safe_load(path.read_text())
+        assert isinstance(config, Mapping)
+    return _build(Protocol, config, f"protocol {config.get('name', '')}".strip())
+
+
+def _build(kind: type[T], config: Mapping[str, Any], where: str) -> T:
+    expected = {field.name: field.type for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    if not isinstance(config, Mapping) or set(config) != set(expected):
+        found = set(config) if isinstance(config, Mapping) else set()
+        raise DexgraspError(
+            f"{where}: the keys {', '.join(expected)}",
+            f"unknown {sorted(found - set(expected))}, missing {sorted(set(expected) - found)}",
+            "correct the YAML in conf/protocol; a change of rules needs a new version",
+        )
+    return kind(**{key: _value(type_, config[key], f"{where}.{key}") for key, type_ in expected.items()})
+
+
+def _value(kind: Any, value: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(kind):
+        return _build(kind, value, where)  # type: ignore[arg-type]
+    optional = kind == float | None
+    if optional and value is None:
+        return None
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if (kind is float or optional) and number and math.isfinite(value) and value >= 0:
+        return float(value)
+    if kind in (int, bool, str) and type(value) is kind:
+        return value
+    name = "a number of at least 0" if kind is float or optional else f"a value of type {kind.__name__}"
+    raise DexgraspError(f"{where}: {name}", repr(value), "correct the YAML in conf/protocol")

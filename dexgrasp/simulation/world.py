@@ -1,0 +1,172 @@
+"""A compiled MuJoCo world: table, objects and, where grasps are tried, a hand. State goes in and comes out by name."""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from dexgrasp.hand import Hand
+from dexgrasp.objects import Object
+from dexgrasp.simulation.hand_model import add_hand, quaternion
+from dexgrasp.simulation.protocol import Physics
+
+Array = NDArray[np.float64]
+
+TABLE, HAND = -1, -2
+"""Owners of contacts beside the objects' numbers."""
+
+MAX_HULL_VERTICES = 64
+ABSENT_HEIGHT = 100.0
+"""Absent objects wait, weightless, this high, m."""
+
+
+class World:
+    """Compiled once for a set of objects, then reset for every attempt.
+
+    Attributes:
+        model, data: MuJoCo's.
+        present: (O,) bool, objects that are there.
+    """
+
+    def __init__(self, objects: Sequence[Object], hand: Hand | None, physics: Physics) -> None:
+        self.hand, self.physics = hand, physics
+        spec = _world(physics)
+        for number, item in enumerate(objects):
+            _add_object(spec, number, item, physics)
+        if hand is not None:
+            add_hand(spec, hand, physics)
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self._bodies = np.array([self.model.body(f"object/{number}").id for number in range(len(objects))], dtype=int)
+        joints = self.model.body_jntadr[self._bodies]
+        self._qpos = self.model.jnt_qposadr[joints]
+        self._qvel = self.model.jnt_dofadr[joints]
+        roots = self.model.body_rootid[self.model.geom_bodyid]
+        self._owner = np.full(self.model.ngeom, HAND)
+        self._owner[roots == 0] = TABLE
+        for number, body in enumerate(self._bodies):
+            self._owner[roots == body] = number
+        self.present = np.ones(len(objects), dtype=bool)
+        if hand is not None:
+            names = [f"hand/{joint}" for joint in hand.joint_names]
+            self.full_qpos = [self.model.joint(f"hand/{joint}").qposadr[0] for joint in hand.full_joint_names]  # type: ignore[attr-defined]
+            self.driver_qpos = np.array([self.model.joint(name).qposadr[0] for name in names])
+            self.driver_qvel = np.array([self.model.joint(name).dofadr[0] for name in names])
+            self._base = self.model.body(f"hand/{hand.tree[0].name}").id  # type: ignore[attr-defined]
+            self._base_qpos = int(self.model.joint("hand").qposadr[0])
+
+    def reset(self, poses: Array) -> None:
+        """Put the objects at `poses` (O, 4, 4), world_T_object, at rest; NaN ones are taken away."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.present = np.isfinite(poses).all(axis=(1, 2))
+        for number, (pose, there) in enumerate(zip(poses, self.present, strict=True)):
+            at = self._qpos[number]
+            self.model.body_gravcomp[self._bodies[number]] = 0.0 if there else 1.0
+            if there:
+                self.data.qpos[at : at + 3] = pose[:3, 3]
+                self.data.qpos[at + 3 : at + 7] = quaternion(pose[:3, :3])
+            else:
+                self.data.qpos[at : at + 3] = [10.0 * number, 0.0, ABSENT_HEIGHT]
+                self.data.qpos[at + 3 : at + 7] = [1.0, 0.0, 0.0, 0.0]
+
+    def place_hand(self, pose: Array, joints: Array) -> None:
+        """Put the hand at world_T_base `pose` (4, 4) with independent `joints` (J,), at rest, its servos there too."""
+        matrix, offset = (np.asarray(part) for part in self.hand.coupling)  # type: ignore[union-attr]
+        at = self._base_qpos
+        self.data.qpos[at : at + 3] = pose[:3, 3]
+        self.data.qpos[at + 3 : at + 7] = quaternion(pose[:3, :3])
+        self.data.qpos[self.full_qpos] = matrix @ joints + offset
+        self.data.mocap_pos[0] = pose[:3, 3]
+        self.data.mocap_quat[0] = quaternion(pose[:3, :3])
+        self.data.ctrl[:] = joints
+        mujoco.mj_forward(self.model, self.data)
+
+    def poses(self) -> Array:
+        """Return world_T_object (O, 4, 4) of all objects; NaN where absent."""
+        result = np.full((len(self._bodies), 4, 4), np.nan)
+        for number in np.flatnonzero(self.present):
+            result[number] = np.eye(4)
+            body, at = self._bodies[number], self._qpos[number]
+            rotation = np.empty(9)
+            mujoco.mju_quat2Mat(rotation, self.data.qpos[at + 3 : at + 7])
+            result[number, :3, :3] = rotation.reshape(3, 3)
+            result[number, :3, 3] = self.data.qpos[at : at + 3]
+        return result
+
+    def centres(self) -> Array:
+        """Return the objects' centres of mass (O, 3), world frame, m."""
+        return self.data.xipos[self._bodies]
+
+    def speeds(self) -> Array:
+        """Return (O,) the larger of linear speed (m/s) and a tenth of angular speed (rad/s) of the objects."""
+        velocity = self.data.qvel[self._qvel[:, None] + np.arange(6)]
+        linear, angular = velocity[:, :3], velocity[:, 3:]
+        return np.maximum(np.linalg.norm(linear, axis=1), 0.1 * np.linalg.norm(angular, axis=1))
+
+    def base(self) -> Array:
+        """Return where the hand's base is (3,), world frame, m."""
+        return self.data.xpos[self._base]
+
+    def touched(self) -> NDArray[np.bool_]:
+        """Return (O,) which objects the hand touches now."""
+        result = np.zeros(len(self._bodies), dtype=bool)
+        pairs = self._pairs()[self.data.contact.dist <= 0]
+        hands = (pairs == HAND).any(axis=1)
+        others = pairs[hands].max(axis=1)
+        result[others[others >= 0]] = True
+        return result
+
+    def intrusion(self) -> float:
+        """Return how deep the hand is inside table or objects now, m."""
+        hands = (self._pairs() == HAND).any(axis=1)
+        depths = -self.data.contact.dist[hands]
+        return float(max(depths.max(initial=0.0), 0.0))
+
+    def _pairs(self) -> NDArray[np.int64]:
+        return self._owner[self.data.contact.geom]
+
+
+def _world(physics: Physics) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.option.timestep = physics.timestep
+    spec.option.gravity = [0.0, 0.0, -physics.gravity]
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = physics.impratio
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    geom = spec.default.geom
+    geom.condim = 4
+    geom.friction = [physics.friction, physics.torsional_friction, 0.0]
+    geom.solref = [physics.contact_time, 1.0]
+    spec.default.mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    spec.default.mesh.maxhullvert = MAX_HULL_VERTICES
+    # A contact takes the larger of both geoms' condim and friction: rolling is resisted on the table only.
+    spec.worldbody.add_geom(
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 1],
+        condim=6,
+        friction=[physics.friction, physics.torsional_friction, physics.rolling_friction],
+    )
+    return spec
+
+
+def _add_object(spec: mujoco.MjSpec, number: int, item: Object, physics: Physics) -> None:
+    body = spec.worldbody.add_body(name=f"object/{number}")
+    body.add_freejoint()
+    volume = item.volume
+    body.explicitinertial = True
+    body.mass = float(np.clip(physics.density * volume, physics.mass_min, physics.mass_max))
+    body.ipos = item.com
+    # trimesh gives the moments about the centre of mass at its own density.
+    moments = np.asarray(item.mesh.moment_inertia) * body.mass / item.mesh.mass
+    values, axes = np.linalg.eigh(moments)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    body.inertia = values
+    body.iquat = quaternion(axes)
+    for index, part in enumerate(item.parts):
+        name = f"object/{number}/{index}"
+        spec.add_mesh(name=name, uservert=np.asarray(part.vertices, dtype=np.float64).ravel())
+        body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, mass=0.0)
