@@ -14,7 +14,7 @@ from dexgrasp.triangle_tree import TriangleTree, nearest, to_triangle, triangle_
 
 STRIDE = 4
 """Grid nodes per coarse node: away from the surface, fine nodes are bounded from coarse ones."""
-BAND = 2.0
+BAND = 6.0
 """Nodes that may be nearer to the surface than this many spacings hold the exact distance."""
 PADDING = 10
 """Spacings by which the grid reaches beyond the object."""

@@ -75,17 +75,17 @@ class HandBody(NamedTuple):
     """(F, 7) fingertip centre, closing axis, radius, in the distal link."""
 
 
-def hand_body(hand: Hand) -> HandBody:
-    """Compile a hand; the result is kept with it."""
+def hand_body(hand: Hand, coarseness: float = 1.0) -> HandBody:
+    """Compile a hand; balls follow its surface `coarseness` times less closely. The result is kept with it."""
     if not isinstance(hand, UrdfHand):
         raise DexgraspError("a UrdfHand", type(hand).__name__, "describe the hand by a URDF")
-    made = hand.__dict__.get("_body")
-    if made is None:
-        made = hand.__dict__["_body"] = _compile(hand)
-    return made
+    made: dict[float, HandBody] = hand.__dict__.setdefault("_bodies", {})
+    if coarseness not in made:
+        made[coarseness] = _compile(hand, coarseness)
+    return made[coarseness]
 
 
-def _compile(hand: UrdfHand) -> HandBody:
+def _compile(hand: UrdfHand, coarseness: float) -> HandBody:
     names = [record.name for record in hand.tree]
     matrix, offset = (part.numpy() for part in hand.coupling)
     limits = np.stack([hand.model.lowerPositionLimit, hand.model.upperPositionLimit], axis=1)
@@ -99,7 +99,8 @@ def _compile(hand: UrdfHand) -> HandBody:
         circle = None
         if finger is not None:
             circle = np.array([*hand.fingers[finger].tip_center.tolist(), hand.fingers[finger].tip_radius])
-        leaves, first = inscribed_balls(hand.collisions[name], TOLERANCE if finger is None else TIP_TOLERANCE, circle)
+        tolerance = coarseness * (TOLERANCE if finger is None else TIP_TOLERANCE)
+        leaves, first = inscribed_balls(hand.collisions[name], tolerance, circle)
         nodes, below, places = ball_tree(leaves)
         if first >= 0:
             tip_balls[finger] = count + places[first]

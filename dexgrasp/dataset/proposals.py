@@ -15,9 +15,16 @@ from dexgrasp.distance import DistanceField
 from dexgrasp.geometry import inverse
 from dexgrasp.hand import Hand
 from dexgrasp.objects import Object
+from dexgrasp.quality import epsilon, wrenches
 
 TRIES = 6
 """A contact-first candidate is the most promising of this many draws."""
+VARIATIONS = 4
+"""A varied one of this many."""
+FRICTION = 0.5
+"""Of the contacts that are guessed to judge a draw."""
+GAP, QUALITY = 0.01, 0.05
+"""What a centimetre of gaps costs is what this much epsilon is worth."""
 WANDER = 0.012
 """How far on the surface a varied grasp's contact may move, m."""
 
@@ -109,11 +116,7 @@ def approach(
 
 
 def contact(hand: Hand, surface: Surface, count: int, rng: np.random.Generator) -> Contacts:
-    """Propose hands from one fingertip contact: uniform draws, the most promising of every few kept.
-
-    Promising: the other fingertips, closed alike, come near the surface; the palm is outside; the centre of mass lies
-    between the fingertips.
-    """
+    """Propose hands from one fingertip contact: uniform draws, the most promising of every few kept."""
     total = count * TRIES
     finger = torch.from_numpy(rng.integers(len(hand.fingers), size=total))
     joints = _uniform(hand, rng, total)
@@ -127,14 +130,16 @@ def contact(hand: Hand, surface: Surface, count: int, rng: np.random.Generator) 
 
 def varied(hand: Hand, surface: Surface, parents: Contacts, count: int, rng: np.random.Generator) -> Contacts:
     """Propose variations of contacts that led to grasps: moved on the surface, turned and closed a little."""
-    pick = torch.from_numpy(rng.integers(len(parents.point), size=count))
-    moved = surface.points[parents.point[pick]] + torch.from_numpy(rng.normal(scale=WANDER, size=(count, 3)))
+    total = count * VARIATIONS
+    pick = torch.from_numpy(rng.integers(len(parents.point), size=total))
+    moved = surface.points[parents.point[pick]] + torch.from_numpy(rng.normal(scale=WANDER, size=(total, 3)))
     point = surface.nearest(moved)
     span = (hand.limits[:, 1] - hand.limits[:, 0]).clamp(max=math.pi)
-    noise = torch.from_numpy(rng.normal(scale=0.05, size=(count, len(span)))) * span
-    xy = parents.xy[pick] + torch.from_numpy(rng.normal(scale=0.12, size=(count, 2)))
+    noise = torch.from_numpy(rng.normal(scale=0.05, size=(total, len(span)))) * span
+    xy = parents.xy[pick] + torch.from_numpy(rng.normal(scale=0.12, size=(total, 2)))
     xy = xy / torch.linalg.vector_norm(xy, dim=1, keepdim=True).clamp(min=1.0)
-    return Contacts(point, parents.finger[pick], xy, hand.clamp(parents.joints[pick] + noise))
+    drawn = Contacts(point, parents.finger[pick], xy, hand.clamp(parents.joints[pick] + noise))
+    return _best(hand, surface, drawn, count)
 
 
 def placed(hand: Hand, surface: Surface, contacts: Contacts) -> Float[Tensor, "N 4 4"]:
@@ -144,16 +149,24 @@ def placed(hand: Hand, surface: Surface, contacts: Contacts) -> Float[Tensor, "N
 
 
 def _best(hand: Hand, surface: Surface, drawn: Contacts, count: int) -> Contacts:
+    """Keep the most promising of every group of draws.
+
+    Each finger is taken to touch where its fingertip circle is nearest to the surface: small gaps, a high epsilon of
+    these contacts and a palm outside the object are what a grasp is made of.
+    """
     pose = placed(hand, surface, drawn)
     tips = (pose[:, None] @ hand.fingertips(drawn.joints))[..., :3, 3]
     radius = torch.tensor([finger.tip_radius for finger in hand.fingers], dtype=torch.float64)
-    gaps = torch.as_tensor(surface.field.lower_bound(tips.reshape(-1, 3))).reshape(tips.shape[:2]) - radius
+    found = surface.field.nearest(tips.reshape(-1, 3))
+    distance, points, normals = (torch.as_tensor(part).reshape(*tips.shape[:2], -1) for part in found)
+    gaps = (distance.squeeze(-1) - radius).abs().sum(dim=1)
+    quality = torch.as_tensor(epsilon(wrenches(points, normals, surface.center, surface.radius, FRICTION)))
     palm = (pose @ hand.base_T_palm)[:, :3, 3]
     buried = torch.as_tensor(surface.field.lower_bound(palm)) < 0.002
-    aside = torch.linalg.vector_norm(tips.mean(dim=1) - surface.center, dim=1)
-    cost = gaps.abs().sum(dim=1) + 0.5 * aside + 10.0 * buried
-    best = cost.reshape(count, TRIES).argmin(dim=1)
-    return drawn[torch.arange(count) * TRIES + best]
+    cost = gaps / GAP - quality / QUALITY + 100.0 * buried
+    group = len(pose) // count
+    best = cost.reshape(count, group).argmin(dim=1)
+    return drawn[torch.arange(count) * group + best]
 
 
 def _close_alike(hand: Hand, joints: Tensor, part: Tensor) -> None:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dexgrasp.closing import MISSES, OFF_TIP, PENETRATES, Closer, close_fingers
+from dexgrasp.closing import CLOSED, MISSES, OFF_TIP, PENETRATES, Closer, close_fingers
 from dexgrasp.collision import HandShape, as_arrays
 from dexgrasp.contact_frame import place, project
 from dexgrasp.dataset.proposals import Contacts, Surface, approach, contact, opened, placed, varied
@@ -18,10 +18,15 @@ from dexgrasp.execution import pregrasp
 from dexgrasp.geometry import rotation_angle
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
+from dexgrasp.hand_body import HandBody, hand_body
 from dexgrasp.objects import Object
 from dexgrasp.quality import epsilon, wrenches
 from dexgrasp.seeds import stream
 
+COARSENESS = 8.0
+"""Candidates are first closed with balls that follow the hand this much less closely,"""
+PASS = 0.7
+"""and pass with this much of the wanted epsilon."""
 LEVER = 0.1
 """Turning the base by an angle counts as moving it by angle x this (m) when the telling finger is chosen."""
 
@@ -34,8 +39,8 @@ class SynthesisSettings:
     edges: int = 8
     epsilon: float = 0.05
     penetration: float = 0.001
-    approach: float = 0.3
-    varied: float = 0.5
+    approach: float = 0.15
+    varied: float = 0.65
     target: int = 2000
     batch: int = 2048
     rounds: int = 40
@@ -43,6 +48,8 @@ class SynthesisSettings:
     retreat: float = 0.10
     opening: float = 0.35
     overlap: float = 0.0005
+    resting: float | None = 0.05
+    table: float = 0.002
     near_position: float = 0.01
     near_angle: float = 0.2
     near_joints: float = 0.2
@@ -120,27 +127,65 @@ class _Search:
     def _judge(self, pose: Float[Tensor, "N 4 4"], start: Float[Tensor, "N J"]) -> Grasps:
         settings, body = self.settings, self.closer.body
         self.candidates += len(pose)
+        # Coarse balls first: most candidates fail by far more than they blur.
+        good, *_ = self._closed(hand_body(self.hand, COARSENESS), pose, start, PASS * settings.epsilon)
+        pose, start = pose[good], start[good]
+        good, full, touches, quality = self._closed(body, pose, start, settings.epsilon)
+        contacts, normals = touches[..., :3], touches[..., 3:]
+        grasps = Grasps.build(pose[good], torch.from_numpy(full[:, body.leaders]), contacts.shape[1])
+        grasps = grasps.replace(
+            contacts=torch.from_numpy(contacts), normals=torch.from_numpy(normals), quality=torch.from_numpy(quality)
+        )
+        _, waiting = pregrasp(self.hand, grasps, settings.retreat, settings.opening)
+        folded = self.shape.self_collision(grasps.joints) | self.shape.self_collision(waiting)
+        grasps, waiting = self._drop(grasps, ~folded, "hand touches itself"), waiting[~folded]
+        clear = self.shape.approach_clear(self.surface.field, grasps.pose, waiting, settings.retreat, settings.overlap)
+        grasps, waiting = self._drop(grasps, clear, "way is blocked"), waiting[clear]
+        grasps = self._drop(grasps, self._above_table(grasps, waiting), "under the table")
+        self.valid += len(grasps)
+        return grasps
+
+    def _above_table(self, grasps: Grasps, waiting: Float[Tensor, "N J"]) -> Bool[Tensor, "N"]:
+        """Tell which grasps keep the hand above the table in some likely resting pose of the object."""
+        settings = self.settings
+        if settings.resting is None:
+            return torch.ones(len(grasps), dtype=torch.bool)
+        reached = torch.zeros(len(grasps), dtype=torch.bool)
+        poses, likelihoods = self.item.stable
+        # What rolls has many resting poses, none of them likely.
+        least = min(settings.resting, likelihoods.max() / 2)
+        for which in np.argsort(-likelihoods, kind="stable"):
+            left = (~reached).nonzero().flatten()
+            if likelihoods[which] < least or not len(left):
+                break
+            lying = torch.from_numpy(poses[which]) @ grasps.pose[left]
+            lowest = torch.stack([self.shape.table_distance(lying, j[left]) for j in (grasps.joints, waiting)])
+            reached[left] = (lowest >= settings.table).all(dim=0)
+        return reached
+
+    def _closed(
+        self, body: HandBody, pose: Float[Tensor, "N 4 4"], start: Float[Tensor, "N J"], threshold: float
+    ) -> tuple[Int[np.ndarray, "K"], Float[np.ndarray, "K M"], Float[np.ndarray, "K F 6"], Float[np.ndarray, "K"]]:
+        """Return which hands close on the object with epsilon >= threshold, their full joints, touches, quality."""
+        settings = self.settings
         status, full, touches, _, _ = close_fingers(
             body, self.surface.field.field, *as_arrays(pose, start), False, True, settings.penetration
         )
         for code, reason in ((PENETRATES, "penetrates"), (MISSES, "finger misses"), (OFF_TIP, "touches off the tip")):
             self.rejected[reason] += int((status == code).sum())
-        good = np.flatnonzero(status == 0)
-        contacts, normals = touches[good, :, :3], touches[good, :, 3:]
-        cones = wrenches(contacts, normals, self.item.com, self.item.radius, settings.friction, settings.edges)
-        quality = epsilon(cones, settings.epsilon)
-        grasps = Grasps.build(pose[good], torch.from_numpy(full[good][:, body.leaders]), contacts.shape[1])
-        grasps = grasps.replace(
-            contacts=torch.from_numpy(contacts), normals=torch.from_numpy(normals), quality=torch.from_numpy(quality)
+        good = np.flatnonzero(status == CLOSED)
+        cones = wrenches(
+            touches[good, :, :3],
+            touches[good, :, 3:],
+            self.item.com,
+            self.item.radius,
+            settings.friction,
+            settings.edges,
         )
-        grasps = self._drop(grasps, grasps.quality >= settings.epsilon, "quality")
-        _, waiting = pregrasp(self.hand, grasps, settings.retreat, settings.opening)
-        folded = self.shape.self_collision(grasps.joints) | self.shape.self_collision(waiting)
-        grasps, waiting = self._drop(grasps, ~folded, "hand touches itself"), waiting[~folded]
-        clear = self.shape.approach_clear(self.surface.field, grasps.pose, waiting, settings.retreat, settings.overlap)
-        grasps = self._drop(grasps, clear, "way is blocked")
-        self.valid += len(grasps)
-        return grasps
+        quality = np.asarray(epsilon(cones, threshold))
+        enough = quality >= threshold
+        self.rejected["quality"] += int((~enough).sum())
+        return good[enough], full[good[enough]], touches[good[enough]], quality[enough]
 
     def _drop(self, grasps: Grasps, good: Bool[Tensor, "N"], reason: str) -> Grasps:
         self.rejected[reason] += int((~good).sum())

@@ -1,0 +1,160 @@
+"""Synthesised grasps: every promise checked anew, by other means than those that made them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from dexgrasp import load_hand
+from dexgrasp.closing import Closer
+from dexgrasp.collision import HandShape
+from dexgrasp.contact_frame import place, project
+from dexgrasp.dataset.proposals import Surface, approach, contact, placed
+from dexgrasp.dataset.synthesis import SynthesisSettings, synthesize
+from dexgrasp.distance import DistanceField
+from dexgrasp.errors import DexgraspError
+from dexgrasp.execution import pregrasp
+from dexgrasp.objects import Object
+from dexgrasp.quality import epsilon, wrenches
+
+SETTINGS = SynthesisSettings(batch=512, rounds=6, target=150)
+
+
+def body(mesh: trimesh.Trimesh, name: str) -> Object:
+    return Object(name, "test", mesh, (mesh.convex_hull,))
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return load_hand("barrett")
+
+
+@pytest.fixture(scope="module")
+def can():
+    return body(trimesh.creation.cylinder(0.033, 0.11, sections=48), "can")
+
+
+@pytest.fixture(scope="module")
+def made(hand, can):
+    return synthesize(hand, can, SETTINGS, 0)
+
+
+def test_grasps_are_found_and_counted(made):
+    grasps, summary = made
+    assert len(grasps) == summary.kept > 20
+    assert summary.note == ""
+    # Every candidate is either valid or rejected once.
+    assert summary.candidates == summary.valid + sum(summary.rejected.values())
+    assert summary.kept <= summary.valid
+
+
+def test_every_finger_touches_the_surface(made, can):
+    grasps, _ = made
+    field = DistanceField.build(can.mesh)
+    assert not grasps.contacts.isnan().any()
+    assert field.distance(grasps.contacts.reshape(-1, 3)).abs().max() < 1e-9
+
+
+def test_quality_is_the_epsilon_of_the_contacts(made, can):
+    grasps, _ = made
+    again = epsilon(wrenches(grasps.contacts, grasps.normals, can.com, can.radius, 0.5, 8))
+    torch.testing.assert_close(again, grasps.quality)
+    assert grasps.quality.min() >= SETTINGS.epsilon
+
+
+def test_nothing_penetrates_at_grasp_and_on_the_way(made, hand, can):
+    grasps, _ = made
+    field, shape = DistanceField.build(can.mesh), HandShape(hand)
+    assert shape.object_distance(field, grasps.pose, grasps.joints).min() > -SETTINGS.penetration
+    for retreat in (0.0, 0.02, 0.05, 0.1):
+        pose, joints = pregrasp(hand, grasps, retreat, SETTINGS.opening)
+        assert shape.object_distance(field, pose, joints).min() > -SETTINGS.overlap - 1e-4
+        assert not shape.self_collision(joints).any()
+    assert not shape.self_collision(grasps.joints).any()
+
+
+def test_closing_again_from_the_pregrasp_gives_the_same_grasp(made, hand, can):
+    grasps, _ = made
+    _, waiting = pregrasp(hand, grasps)
+    closure = Closer(hand).close(DistanceField.build(can.mesh), grasps.pose, waiting)
+    assert closure.on_tip.all()
+    assert (closure.joints - grasps.joints).abs().max() < 5e-3
+
+
+def test_the_hand_stays_above_the_table_in_some_resting_pose(made, hand, can):
+    grasps, _ = made
+    shape = HandShape(hand)
+    poses, _ = can.stable
+    heights = torch.stack([shape.table_distance(torch.from_numpy(p) @ grasps.pose, grasps.joints) for p in poses])
+    assert (heights.max(dim=0).values >= SETTINGS.table - 1e-9).all()
+
+
+def test_the_telling_finger_is_the_one_that_loses_least(made, hand):
+    grasps, _ = made
+
+    def moved(finger):
+        rows = torch.arange(len(grasps))
+        points, normals = grasps.contacts[rows, finger], grasps.normals[rows, finger]
+        xy, known = project(hand, finger, points, normals, grasps.pose, grasps.joints)
+        away = (place(hand, finger, points, normals, xy, grasps.joints) - grasps.pose)[:, :3, 3].norm(dim=1)
+        return torch.where(known, away, torch.inf)
+
+    chosen = moved(grasps.finger)
+    fixed = moved(torch.zeros_like(grasps.finger))
+    assert chosen.median() < 2e-3
+    assert chosen.median() <= fixed.median()
+
+
+def test_grasps_are_distinct_and_spread(made, can):
+    grasps, _ = made
+    keys = torch.cat([grasps.pose.flatten(1), grasps.joints], dim=1)
+    distance = torch.cdist(keys, keys, compute_mode="donot_use_mm_for_euclid_dist")
+    distance.fill_diagonal_(1)
+    assert distance.min() > 1e-3
+    azimuth = torch.atan2(grasps.contacts[:, 0, 1], grasps.contacts[:, 0, 0])
+    assert torch.histc(azimuth, 6, -np.pi, np.pi).min() > 0
+
+
+def test_same_seed_same_grasps(hand, can, made):
+    again, summary = synthesize(hand, can, SETTINGS, 0)
+    assert summary == made[1]
+    for name, value in again.tensors().items():
+        assert torch.equal(value, made[0].tensors()[name]), name
+    other, _ = synthesize(hand, can, dataclasses.replace(SETTINGS, rounds=1), 1)
+    assert not torch.equal(other.pose[:5], again.pose[:5])
+
+
+def test_an_object_too_large_says_why(hand):
+    grasps, summary = synthesize(
+        hand,
+        body(trimesh.creation.box((0.5, 0.5, 0.5)), "crate"),
+        SynthesisSettings(batch=256, rounds=2),
+        0,
+    )
+    assert len(grasps) == 0 and summary.kept == 0
+    assert "crate" in summary.note and "misses" in summary.note
+
+
+def test_proposals_do_what_they_say(hand, can):
+    field = DistanceField.build(can.mesh)
+    rng = np.random.default_rng(0)
+    surface = Surface.sample(can, field, 0.004, rng)
+    assert field.distance(surface.points).abs().max() < 1e-9
+    pose, joints = approach(hand, surface, 50, rng)
+    palm = pose @ hand.base_T_palm
+    ahead = surface.field.distance(palm[:, :3, 3])
+    assert (torch.linalg.det(palm[:, :3, :3]) - 1).abs().max() < 1e-9
+    assert (joints[:, 1:] == 0).all() and joints[:, 0].std() > 0.5
+    assert (ahead > -1e-9).float().mean() > 0.7
+    contacts = contact(hand, surface, 50, rng)
+    tips = (placed(hand, surface, contacts)[:, None] @ hand.fingertips(contacts.joints))[..., :3, 3]
+    chosen = tips[torch.arange(50), contacts.finger]
+    away = (chosen - surface.points[contacts.point]).norm(dim=1)
+    torch.testing.assert_close(away, torch.full_like(away, hand.fingers[0].tip_radius))
+
+
+def test_settings_are_checked():
+    with pytest.raises(DexgraspError, match="shares"):
+        SynthesisSettings(approach=0.8, varied=0.5)
