@@ -1,9 +1,10 @@
 """Rigid objects and sets of them: what is grasped."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, overload
 
 import numpy as np
@@ -122,7 +123,7 @@ def load_objects(config: Mapping[str, Any]) -> ObjectSet:
     Raises DexgraspError for unknown kinds and keys.
     """
     options = {str(key): value for key, value in config.items() if key not in ("kind", "name")}
-    loaders = {"procedural": procedural, "folder": _folder}
+    loaders: dict[str, Callable[..., ObjectSet]] = {"procedural": procedural, "folder": _folder}
     kind = config.get("kind")
     if kind not in loaders:
         raise DexgraspError("objects.kind to be procedural or folder", repr(kind), "set objects.kind")
@@ -205,7 +206,7 @@ def object_from_tensors(tensors: Mapping[str, Tensor]) -> Object:
     name, family, source = json.loads(arrays["texts"].tobytes())
     offsets = arrays["part_offsets"]
     bodies = [(arrays["vertices"], arrays["faces"])]
-    for (v0, f0), (v1, f1) in zip(offsets[:-1], offsets[1:], strict=True):
+    for (v0, f0), (v1, f1) in pairwise(offsets):
         bodies.append((arrays["part_vertices"][v0:v1], arrays["part_faces"][f0:f1]))
     volume, radius = map(float, arrays["size"])
     stable = (arrays["stable_poses"], arrays["stable_probabilities"])

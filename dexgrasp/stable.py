@@ -96,7 +96,7 @@ def _solid_angles(corners: Array) -> Array:
 
 
 def _resting(down: Array, com: Array, vertices: Array) -> Array:
-    """world_T_object that turns the direction `down` (object frame) to -z by the shortest way, lowest point on z = 0."""
+    """world_T_object with the direction `down` (object frame) on -z and the lowest point on z = 0."""
     rotation = trimesh.geometry.align_vectors(down, [0.0, 0.0, -1.0])[:3, :3]
     pose = np.eye(4)
     pose[:3, :3] = rotation

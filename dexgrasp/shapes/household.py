@@ -3,7 +3,7 @@
 import numpy as np
 
 from dexgrasp.shapes.outline import arc, fillet
-from dexgrasp.shapes.solid import Solid, balls, box, ellipsoid
+from dexgrasp.shapes.solid import Solid, balls, box, ellipsoid, hull, octasphere
 from dexgrasp.shapes.swept import tube
 from dexgrasp.shapes.turned import lathe, shell
 
@@ -87,9 +87,8 @@ def controller(rng: Rng) -> Solid:
 def mouse(rng: Rng) -> Solid:
     """A computer mouse, or a stone."""
     long, wide, high = rng.uniform(0.09, 0.115), rng.uniform(0.052, 0.064), rng.uniform(0.032, 0.042)
-    x, y = long / 2 - 0.014, wide / 2 - 0.012
-    low = [(s * x, t * y, 0.010) for s in (-1, 1) for t in (-1, 1)]
-    return balls([*low, (-0.35 * x, 0, high - 0.02), (0.6 * x, 0, 0.016)], [0.010] * 4 + [0.02, 0.014])
+    dome = octasphere(14) * [long / 2, wide / 2, 0.75 * high]
+    return hull(np.column_stack([dome[:, :2], np.maximum(dome[:, 2], -0.25 * high)]))
 
 
 def stapler(rng: Rng) -> Solid:

@@ -1,5 +1,7 @@
 """Polylines: rounding their corners, cutting and thinning them within a tolerance."""
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -48,7 +50,7 @@ def thin(line: Points, most: int, tolerance: float) -> tuple[Points, float]:
     kept = [0, len(line) - 1]
     while True:
         gaps = np.zeros(len(line))
-        for a, b in zip(kept, kept[1:], strict=False):
+        for a, b in pairwise(kept):
             gaps[a : b + 1] = away(line[a : b + 1])
         worst = int(gaps.argmax())
         if gaps[worst] <= tolerance or len(kept) >= most:
@@ -66,4 +68,4 @@ def dent(line: Points) -> float:
                 break
             upper.pop()
         upper.append(index)
-    return max(float(away(line[a : b + 1]).max()) for a, b in zip(upper, upper[1:], strict=False))
+    return max(float(away(line[a : b + 1]).max()) for a, b in pairwise(upper))

@@ -106,7 +106,10 @@ def box(size: ArrayLike, edge: float = 0.003) -> Solid:
 
 def ellipsoid(semi_axes: ArrayLike) -> Solid:
     """An ellipsoid about the origin by its semi-axes (m)."""
-    return hull(octasphere(12) * np.asarray(semi_axes, dtype=float))
+    axes = np.asarray(semi_axes, dtype=float)
+    body = manifold3d.Manifold.hull_points(octasphere(12) * axes)
+    part = fibonacci(MOST_VERTICES) * axes
+    return Solid(body, (part * (body.volume() / manifold3d.Manifold.hull_points(part).volume()) ** (1 / 3),))
 
 
 def prism(outline: ArrayLike, height: float, edge: float = 0.003) -> Solid:

@@ -97,7 +97,8 @@ def brush(rng: Rng) -> Solid:
     )
     ferrule = box([width * 1.2, 0.028, 0.025], 0.004).at((0, 0, length + 0.012))
     flare = [(x, y, length + 0.02) for x in (-0.55 * width, 0.55 * width) for y in (-0.009, 0.009)]
-    tips = [(1.25 * x, 1.2 * y, z + rng.uniform(0.03, 0.05)) for x, y, z in flare]
+    bristle = rng.uniform(0.03, 0.05)
+    tips = [(1.25 * x, 1.2 * y, z + bristle) for x, y, z in flare]
     return handle | ferrule | balls(flare + tips, 0.0025)
 
 

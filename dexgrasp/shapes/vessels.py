@@ -13,7 +13,8 @@ Rng = np.random.Generator
 def bowl(rng: Rng) -> Solid:
     """A bowl."""
     foot, rim, height = rng.uniform(0.02, 0.035), rng.uniform(0.048, 0.072), rng.uniform(0.035, 0.065)
-    outline = [(0, 0), (foot, 0), (rng.uniform(0.75, 0.95) * rim, 0.4 * height), (rim, height)]
+    belly = float(rng.uniform(0.75, 0.95) * rim)
+    outline = [(0.0, 0.0), (foot, 0.0), (belly, 0.4 * height), (rim, height)]
     return shell(fillet(outline, 0.03, 6), rng.uniform(0.004, 0.006))
 
 
