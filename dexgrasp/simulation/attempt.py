@@ -52,10 +52,8 @@ class Attempt:
     def __init__(self, world: World, poses: Array, plan: Plan, protocol: Protocol, target: int = -1) -> None:
         self.world, self.plan, self.protocol, self.target = world, plan, protocol, target
         self.model, self.data = world.model, world.data
-        self.efforts = world.hand.efforts.numpy()  # type: ignore[union-attr]
         self.limits = world.hand.limits.numpy()  # type: ignore[union-attr]
         world.reset(poses)
-        self._effort(1.0)
         world.place_hand(plan.start_pose, plan.start_joints)
         self.initial = world.centres().copy()
         self.first = -1
@@ -90,42 +88,49 @@ class Attempt:
         return bool(np.linalg.norm(self.world.base() - self.plan.pose[:3, 3]) <= verdict.blocked)
 
     def _close(self) -> None:
-        motion = self.protocol.motion
-        self._effort(motion.closing_effort)
+        """Close all fingers until they stall, then squeeze.
+
+        Fingers do not yield: as with a worm gear, a servo's goal never goes back, so that two fingers which push
+        with the searching effort cannot drive back a third, which resists with all of its effort.
+        """
+        motion, error = self.protocol.motion, self.protocol.physics.servo_error
+        lower, upper = self.limits.T
+        direction, closing = self.plan.direction, self.plan.direction != 0
         way = self.plan.joints - self.plan.start_joints
-        closing = self.plan.direction != 0
         steps = max(self._steps(float(np.abs(way).max(initial=0.0)) / motion.closing_speed), 1)
-        beyond = motion.overdrive if motion.overdrive is not None else np.inf
+        beyond = np.inf if motion.overdrive is None else motion.overdrive
         speed = motion.closing_speed * self.protocol.physics.timestep
+        lead = motion.closing_effort * error
+        goal = self.plan.start_joints.copy()
         for step in range(steps + self._steps(motion.closing_time)):
             if step < steps:
-                goal = self.plan.start_joints + (step + 1) / steps * way
+                wanted = self.plan.start_joints + (step + 1) / steps * way
             else:
-                goal = self.plan.joints + self.plan.direction * min((step + 1 - steps) * speed, beyond)
-            self.data.ctrl[:] = np.clip(goal, self.limits[:, 0], self.limits[:, 1])
+                wanted = self.plan.joints + direction * min((step + 1 - steps) * speed, beyond)
+            joints = self.data.qpos[self.world.driver_qpos]
+            ahead = np.minimum(direction * wanted, direction * joints + lead)
+            goal[closing] = (direction * np.maximum(direction * goal, ahead))[closing]
+            goal = np.clip(goal, lower, upper)
+            self.data.ctrl[:] = goal
             mujoco.mj_step(self.model, self.data)
             if step % CHECK == 0:
                 self._look()
-                driven = np.abs(self.data.ctrl - self.data.qpos[self.world.driver_qpos])
-                pushing = driven >= motion.closing_effort * self.protocol.physics.servo_error
-                ended = np.isclose(self.data.ctrl, self.limits[:, 1]) | np.isclose(self.data.ctrl, self.limits[:, 0])
+                joints = self.data.qpos[self.world.driver_qpos]
                 still = np.abs(self.data.qvel[self.world.driver_qvel]) < STALLED
-                done = (still & (pushing | ended))[closing].all()
-                if step >= steps and (done or (step + 1 - steps) * speed > beyond):
+                pushing = direction * (goal - joints) > 0.9 * lead
+                ended = np.where(direction > 0, goal >= upper, goal <= lower)
+                driven = (step + 1 - steps) * speed > beyond
+                if step >= steps and (driven or (still & (pushing | ended))[closing].all()):
                     break
-        if motion.overdrive is None:
-            # From here on the servos pull as hard as they can, wherever the fingers stand.
-            reach = self.plan.direction * 4 * self.protocol.physics.servo_error
-            held = self.data.qpos[self.world.driver_qpos] + reach
-            self.data.ctrl[closing] = np.clip(held, self.limits[:, 0], self.limits[:, 1])[closing]
+        if motion.overdrive is not None:
+            return
         steps = self._steps(motion.squeeze_time)
         for step in range(steps):
-            share = motion.closing_effort + (1 - motion.closing_effort) * (step + 1) / steps
-            self._effort(share)
+            squeeze = direction * (step + 1) / steps * (motion.grip_effort - motion.closing_effort) * error
+            self.data.ctrl[:] = np.clip(goal + squeeze, lower, upper)
             mujoco.mj_step(self.model, self.data)
             if step % CHECK == 0:
                 self._look()
-        self._effort(1.0)
 
     def _lift(self) -> bool:
         """Return True when the hand lost everything on the way."""
@@ -181,10 +186,6 @@ class Attempt:
         highest = int(np.argmax(rise)) if len(rise) else -1
         number = highest if highest >= 0 and rise[highest] > TOUCHED_AGAINST_TABLE else self.first
         return Result(reason, number, float(rise[number]) if number >= 0 else 0.0, self.world.poses())
-
-    def _effort(self, share: float) -> None:
-        self.model.actuator_forcerange[:, 0] = -share * self.efforts
-        self.model.actuator_forcerange[:, 1] = share * self.efforts
 
     def _steps(self, time: float) -> int:
         return round(time / self.protocol.physics.timestep)

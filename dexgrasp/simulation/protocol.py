@@ -65,11 +65,13 @@ class Motion:
     overdrive: float | None
     """How far closing joints are driven past the grasp's angles, rad or m; None: until they stall."""
     closing_effort: float
-    """Share of the effort limit while the fingers search for contact; then it rises to all of it."""
+    """Share of the effort limit with which a finger searches for contact."""
+    grip_effort: float
+    """Share of the effort limit with which it then squeezes; what is left resists being driven back."""
     closing_time: float
     """Longest time to close after the grasp's angles were reached, s."""
     squeeze_time: float
-    """Time to raise the effort to its limit, s."""
+    """Time from the one effort to the other, s."""
     lift: float
     """m."""
     lift_time: float
