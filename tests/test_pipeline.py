@@ -27,6 +27,8 @@ from dexgrasp.geometry import inverse
 TINY = [
     "dataset=smoke",
     "dataset.objects.count=2",
+    "dataset.synthesis.target=100",
+    "dataset.synthesis.rounds=2",
     "dataset.scenes.count=4",
     "dataset.scenes.counts=[2]",
     "dataset.views.framing.points=2048",
@@ -178,6 +180,7 @@ def test_bad_settings_leave_no_trace(tmp_path: Path) -> None:
     assert not (tmp_path / "data").exists()
 
 
+@pytest.mark.slow
 def test_interrupt_leaves_whole_shards_and_is_taken_up(made: tuple[DictConfig, Dataset], tmp_path: Path) -> None:
     command = [sys.executable, "-m", "dexgrasp", "dataset", *TINY, f"dataset.root={tmp_path / 'data'}"]
     run = subprocess.Popen(
