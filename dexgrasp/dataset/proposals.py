@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -17,8 +17,10 @@ from dexgrasp.hand import Hand
 from dexgrasp.objects import Object
 from dexgrasp.quality import epsilon, wrenches
 
-TRIES = 6
+TRIES = 12
 """A contact-first candidate is the most promising of this many draws."""
+APPROACHES = 4
+"""Palm-first candidates are those out of this many draws that stay above the table, where there are enough."""
 VARIATIONS = 4
 """A varied one of this many."""
 FRICTION = 0.5
@@ -40,9 +42,18 @@ class Surface:
     """Centre of mass."""
     radius: float
     field: DistanceField
+    tables: Float[Tensor, "K 4"]
+    """Heights above the table, a . x + b, in the resting poses that count; none where there is no table."""
 
     @classmethod
-    def sample(cls, item: Object, field: DistanceField, spacing: float, rng: np.random.Generator) -> "Surface":
+    def sample(
+        cls,
+        item: Object,
+        field: DistanceField,
+        spacing: float,
+        rng: np.random.Generator,
+        tables: Float[Tensor, "K 4"] | None = None,
+    ) -> "Surface":
         """Sample an object's surface uniformly in voxel space, voxels of `spacing` (m)."""
         count = int(np.clip(8 * item.mesh.area / spacing**2, 1000, 200_000))
         points, faces = trimesh.sample.sample_surface(item.mesh, count, seed=int(rng.integers(2**31)))
@@ -54,7 +65,15 @@ class Surface:
             center=torch.from_numpy(np.asarray(item.com)),
             radius=item.radius,
             field=field,
+            tables=torch.zeros(0, 4, dtype=torch.float64) if tables is None else tables,
         )
+
+    def out_of_reach(self, points: Float[Tensor, "N P 3"]) -> Bool[Tensor, "N"]:
+        """Return for which sets of points some lie under the table, whatever way the object rests."""
+        if not len(self.tables):
+            return torch.zeros(len(points), dtype=torch.bool)
+        heights = points @ self.tables[:, :3].T + self.tables[:, 3]
+        return (heights.amin(dim=1) < 0).all(dim=1)
 
     def nearest(self, points: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
         """Return the nearest surface point of each."""
@@ -99,20 +118,24 @@ def approach(
 
     Returns object_T_base and open postures. Depth is the palm's distance from the point, up to the hand's reach.
     """
-    pick = torch.from_numpy(rng.integers(len(surface.points), size=count))
-    unit = torch.from_numpy(_strata(rng, count, 3))
-    joints = opened(hand, _uniform(hand, rng, count))
+    total = count * APPROACHES
+    pick = torch.from_numpy(rng.integers(len(surface.points), size=total))
+    unit = torch.from_numpy(_strata(rng, total, 2))
+    joints = opened(hand, _uniform(hand, rng, total))
     z = -surface.normals[pick]
     helper = torch.eye(3, dtype=torch.float64)[z.abs().argmin(dim=1)]
     x = torch.nn.functional.normalize(torch.linalg.cross(z, helper), dim=1)
     y = torch.linalg.cross(z, x)
     roll = 2 * math.pi * unit[:, :1]
     x = torch.cos(roll) * x + torch.sin(roll) * y
-    object_T_palm = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    object_T_palm = torch.eye(4, dtype=torch.float64).repeat(total, 1, 1)
     object_T_palm[:, :3, :3] = torch.stack([x, torch.linalg.cross(z, x), z], dim=2)
-    depth = 0.005 + (_reach(hand) - 0.005) * unit[:, 1:2]
+    depth = 0.005 + (_reach(hand) - 0.005) * unit[:, 1:]
     object_T_palm[:, :3, 3] = surface.points[pick] - depth * z
-    return object_T_palm @ inverse(hand.base_T_palm), joints
+    pose = object_T_palm @ inverse(hand.base_T_palm)
+    under = surface.out_of_reach(torch.stack([object_T_palm[:, :3, 3], pose[:, :3, 3]], dim=1))
+    best = torch.argsort(under.long(), stable=True)[:count]
+    return pose[best], joints[best]
 
 
 def contact(hand: Hand, surface: Surface, count: int, rng: np.random.Generator) -> Contacts:
@@ -163,7 +186,8 @@ def _best(hand: Hand, surface: Surface, drawn: Contacts, count: int) -> Contacts
     quality = torch.as_tensor(epsilon(wrenches(points, normals, surface.center, surface.radius, FRICTION)))
     palm = (pose @ hand.base_T_palm)[:, :3, 3]
     buried = torch.as_tensor(surface.field.lower_bound(palm)) < 0.002
-    cost = gaps / GAP - quality / QUALITY + 100.0 * buried
+    under = surface.out_of_reach(torch.cat([tips, palm[:, None], pose[:, None, :3, 3]], dim=1))
+    cost = gaps / GAP - quality / QUALITY + 100.0 * (buried | under)
     group = len(pose) // count
     best = cost.reshape(count, group).argmin(dim=1)
     return drawn[torch.arange(count) * group + best]

@@ -27,6 +27,8 @@ COARSENESS = 8.0
 """Candidates are first closed with balls that follow the hand this much less closely,"""
 PASS = 0.7
 """and pass with this much of the wanted epsilon."""
+ROLLING = 32
+"""At most so many resting poses of an object are looked at."""
 LEVER = 0.1
 """Turning the base by an angle counts as moving it by angle x this (m) when the telling finger is chosen."""
 
@@ -86,7 +88,8 @@ def synthesize(hand: Hand, item: Object, settings: SynthesisSettings, seed: int)
     the one whose contact tells the pose best (METHOD section 1). The same seed gives the same grasps.
     """
     body = DistanceField.build(item.mesh)
-    surface = Surface.sample(item, body, settings.spacing, stream(seed, "surface", item.name))
+    tables = None if settings.resting is None else _resting(item, settings.resting)[:, 2]
+    surface = Surface.sample(item, body, settings.spacing, stream(seed, "surface", item.name), tables)
     search = _Search(hand, item, surface, settings)
     for number in range(settings.rounds):
         search.round(stream(seed, "synthesis", item.name, number))
@@ -151,14 +154,9 @@ class _Search:
         if settings.resting is None:
             return torch.ones(len(grasps), dtype=torch.bool)
         reached = torch.zeros(len(grasps), dtype=torch.bool)
-        poses, likelihoods = self.item.stable
-        # What rolls has many resting poses, none of them likely.
-        least = min(settings.resting, likelihoods.max() / 2)
-        for which in np.argsort(-likelihoods, kind="stable"):
+        for pose in _resting(self.item, settings.resting):
             left = (~reached).nonzero().flatten()
-            if likelihoods[which] < least or not len(left):
-                break
-            lying = torch.from_numpy(poses[which]) @ grasps.pose[left]
+            lying = pose @ grasps.pose[left]
             lowest = torch.stack([self.shape.table_distance(lying, j[left]) for j in (grasps.joints, waiting)])
             reached[left] = (lowest >= settings.table).all(dim=0)
         return reached
@@ -203,6 +201,14 @@ class _Search:
             return ""
         reasons = ", ".join(f"{reason}: {count}" for reason, count in self.rejected.most_common() if count)
         return f"none of {self.candidates} candidates on {self.item.name} is a grasp ({reasons})"
+
+
+def _resting(item: Object, least: float) -> Float[Tensor, "K 4 4"]:
+    """Return the resting poses world_T_object that count, likeliest first."""
+    poses, likelihoods = item.stable
+    # What rolls has many resting poses, none of them likely: some of the likeliest stand for all.
+    order = np.argsort(-likelihoods, kind="stable")[:ROLLING]
+    return torch.from_numpy(poses[order[likelihoods[order] >= min(least, likelihoods.max() / 2)]])
 
 
 def tell(hand: Hand, surface: Surface, grasps: Grasps) -> tuple[Grasps, Contacts]:
