@@ -40,7 +40,7 @@ def main(argv: list[str] | None = None) -> int:
             return int(import_module(f"dexgrasp.commands.{command}").tool(rest) or 0)
         if command in PIPELINES:
             return tool(command, rest) if rest and rest[0].isidentifier() else pipeline(command, rest)
-        from dexgrasp.plugins import unknown
+        from dexgrasp.registry import unknown
 
         raise unknown("command", command, [*PIPELINES, *TOOLS])
     except DexgraspError as error:

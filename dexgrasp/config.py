@@ -12,13 +12,13 @@ from hydra.experimental.callback import Callback
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from dexgrasp import launcher, plugins
+from dexgrasp import launcher, registry
 from dexgrasp.errors import DexgraspError
 
 
 def package(name: str) -> str:
     """Resolve `${package:name}`: the folder of an installed package, found without importing it."""
-    folder = plugins.package_folder(name)
+    folder = registry.package_folder(name)
     if folder is None:
         raise DexgraspError(f"an installed package {name!r}", "none", "install the distribution that holds it")
     return str(folder)
@@ -31,7 +31,7 @@ OmegaConf.register_new_resolver("first", lambda *values: next((v for v in values
 
 def conf_folder() -> Path:
     """Return the folder of our own configs (inside the package in a wheel, beside it in a source tree)."""
-    folder = plugins.conf_folder("dexgrasp")
+    folder = registry.conf_folder("dexgrasp")
     if folder is None:
         raise DexgraspError("the folder conf of dexgrasp", "none", "reinstall dexgrasp")
     return folder
@@ -41,7 +41,7 @@ class PluginSearchPath(SearchPathPlugin):
     """Appends the `conf/` of every installed plugin; as files, because `pkg://` would import the plugin."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        for name, folder in plugins.conf_folders():
+        for name, folder in registry.conf_folders():
             search_path.append(provider=name, path=f"file://{folder}")
 
 

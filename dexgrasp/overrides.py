@@ -12,7 +12,7 @@ from yaml import YAMLError
 
 from dexgrasp.config import conf_folder
 from dexgrasp.errors import DexgraspError
-from dexgrasp.plugins import unknown
+from dexgrasp.registry import unknown
 
 
 def explain(error: Exception, command: str, overrides: list[str]) -> DexgraspError:

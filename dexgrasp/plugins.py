@@ -1,29 +1,38 @@
-"""Hands, representations and backbones: from an entry point's name to an object.
+"""Hands, representations and backbones by name or from a composed config.
 
 A plugin is an entry point of one of three groups. Its value names a class, or for a hand a package that holds only a
-YAML and a URDF. Nothing of a plugin is imported before it is asked for by name; its YAML,
-``<package>/conf/<kind>/<name>.yaml``, has the key `name`, which picks the entry point, and constructor arguments.
+YAML and a URDF. Its YAML, ``<package>/conf/<kind>/<name>.yaml``, has the key `name`, which picks the entry point, and
+constructor arguments.
 """
 
-import ast
 import difflib
 import inspect
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dexgrasp.errors import DexgraspError
+from dexgrasp.registry import GROUPS, conf_folder, conf_folders, find, installed, load_class, named, names, top_package
 
 if TYPE_CHECKING:
     from dexgrasp.backbone import Backbone
     from dexgrasp.hand import Hand
     from dexgrasp.representation import Representation
 
-GROUPS = {"hand": "dexgrasp.hands", "repr": "dexgrasp.representations", "backbone": "dexgrasp.backbones"}
-"""Entry-point group of each kind; the kind is also the name of the config group."""
+__all__ = [
+    "GROUPS",
+    "build_backbone",
+    "build_hand",
+    "build_representation",
+    "conf_folders",
+    "installed",
+    "load_backbone",
+    "load_class",
+    "load_hand",
+    "load_representation",
+    "names",
+    "read",
+]
 
 
 def load_hand(name: str, **overrides: Any) -> "Hand":
@@ -53,7 +62,7 @@ def build_hand(config: Mapping[str, Any]) -> "Hand":
     from dexgrasp.urdf import UrdfHand
 
     options = _resolved("hand", config)
-    plain = {"urdf", "fingers"} <= options.keys() and not _named("hand", options["name"])
+    plain = {"urdf", "fingers"} <= options.keys() and not named("hand", options["name"])
     hand_class = UrdfHand if plain or not find("hand", options["name"]).attr else load_class("hand", options["name"])
     hand = _construct(hand_class, options)
     assert isinstance(hand, Hand)
@@ -70,161 +79,6 @@ def build_backbone(config: Mapping[str, Any]) -> "Backbone":
     """Return the backbone of a composed config, as `build_hand`."""
     options = _resolved("backbone", config)
     return _construct(load_class("backbone", options["name"]), options)
-
-
-@dataclass(frozen=True)
-class Plugin:
-    """What is known of a plugin without importing it."""
-
-    kind: str
-    name: str
-    distribution: str
-    summary: str
-
-
-def installed(kind: str | None = None) -> list[Plugin]:
-    """Return all plugins, of one kind or of all, sorted; nothing is imported."""
-    kinds = [kind] if kind else list(GROUPS)
-    return [
-        Plugin(kind, entry.name, _distribution(entry), _summary(entry))
-        for kind in kinds
-        for entry in sorted(_entries(kind), key=lambda entry: entry.name)
-    ]
-
-
-def names(kind: str) -> list[str]:
-    """Return the names of the installed plugins of one kind, sorted."""
-    return sorted({entry.name for entry in _entries(kind)})
-
-
-def find(kind: str, name: str) -> EntryPoint:
-    """Return the one entry point of that name; `DexgraspError` where there is none or more than one."""
-    found = _named(kind, name)
-    if not found:
-        raise unknown(kind, name, names(kind))
-    if len(found) > 1:
-        owners = " and ".join(sorted(f"{_distribution(entry)} ({entry.value})" for entry in found))
-        raise DexgraspError(
-            f"one distribution that provides the {kind} {name!r}",
-            f"{len(found)}: {owners}",
-            "uninstall all but one, or rename the entry point in the pyproject.toml of yours",
-        )
-    return found[0]
-
-
-def load_class(kind: str, name: str) -> type:
-    """Import the class behind an entry point and check its type."""
-    entry = find(kind, name)
-    plugin = f"the {kind} {name!r} ({entry.value}) of distribution {_distribution(entry)}"
-    try:
-        loaded = entry.load()
-    except Exception as error:
-        raise DexgraspError(
-            f"{plugin} to import",
-            f"{type(error).__name__}: {error}",
-            "repair or uninstall that distribution; all other plugins keep working",
-        ) from error
-    base = _base(kind)
-    if not (isinstance(loaded, type) and issubclass(loaded, base)):
-        raise DexgraspError(
-            f"{plugin} to be a subclass of {base.__module__}.{base.__name__}",
-            f"{loaded!r}",
-            f"derive it from {base.__name__}, or move the entry point to the group of its kind: {GROUPS}",
-        )
-    if inspect.isabstract(loaded):
-        missing = ", ".join(sorted(getattr(loaded, "__abstractmethods__", ())))
-        raise DexgraspError(f"{plugin} to be complete", f"abstract methods: {missing}", "define them in the class")
-    return loaded
-
-
-def unknown(kind: str, name: str, known: list[str]) -> DexgraspError:
-    """Return the error for a name that is not there: did you mean, and what is installed."""
-    close = difflib.get_close_matches(str(name), known, n=1)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    listed = ", ".join(known) or "none"
-    return DexgraspError(
-        f"an installed {kind}: {listed}", repr(name), f"{hint}`python -m dexgrasp plugins` lists what is installed"
-    )
-
-
-def conf_folders() -> list[tuple[str, Path]]:
-    """Return (top-level package, its config folder) of every plugin that has one, ours first; nothing is imported."""
-    order = {(_distribution(entry) != "dexgrasp", _package(entry)) for kind in GROUPS for entry in _entries(kind)}
-    packages = dict.fromkeys(package for _, package in sorted(order))
-    return [(package, folder) for package in packages if (folder := conf_folder(package)) is not None]
-
-
-def conf_folder(package: str) -> Path | None:
-    """Return the first that exists of ``package/conf`` and ``package/../conf`` (a source tree)."""
-    home = package_folder(package)
-    if home is None:
-        return None
-    return next((folder for folder in (home / "conf", home.parent / "conf") if folder.is_dir()), None)
-
-
-def package_folder(package: str) -> Path | None:
-    """Return the folder of a package, dotted or not, without importing anything; None where there is none."""
-    top, *rest = package.split(".")
-    try:
-        spec = find_spec(top)
-    except (ImportError, ValueError):
-        return None
-    for location in (spec.submodule_search_locations or ()) if spec else ():
-        folder = Path(location).joinpath(*rest)
-        if folder.is_dir():
-            return folder.resolve()
-    return None
-
-
-def _entries(kind: str) -> list[EntryPoint]:
-    if kind not in GROUPS:
-        raise DexgraspError(f"a kind of plugin: {', '.join(GROUPS)}", repr(kind), "use one of them")
-    unique = {(entry.name, entry.value, _distribution(entry)): entry for entry in entry_points(group=GROUPS[kind])}
-    return list(unique.values())
-
-
-def _named(kind: str, name: str) -> list[EntryPoint]:
-    return [entry for entry in _entries(kind) if entry.name == name]
-
-
-def _distribution(entry: EntryPoint) -> str:
-    return entry.dist.name if entry.dist else "(unknown)"
-
-
-def _package(entry: EntryPoint) -> str:
-    return entry.module.split(".")[0]
-
-
-def _base(kind: str) -> type:
-    if kind == "hand":
-        from dexgrasp.hand import Hand
-
-        return Hand
-    if kind == "repr":
-        from dexgrasp.representation import Representation
-
-        return Representation
-    from dexgrasp.backbone import Backbone
-
-    return Backbone
-
-
-def _summary(entry: EntryPoint) -> str:
-    """First line of the docstring of the class or else the module, read without importing."""
-    home = package_folder(_package(entry))
-    if home is None:
-        return f"broken: package {_package(entry)} is not there"
-    stem = home.joinpath(*entry.module.split(".")[1:])
-    source = next((path for path in (stem / "__init__.py", stem.with_suffix(".py")) if path.is_file()), None)
-    if source is None:
-        return f"broken: module {entry.module} is not there"
-    try:
-        tree = ast.parse(source.read_text(encoding="utf-8"))
-    except (SyntaxError, UnicodeDecodeError) as error:
-        return f"broken: {error}"
-    nodes: list[ast.ClassDef | ast.Module] = [tree]
-    nodes[:0] = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == entry.attr]
-    return next((text for node in nodes if (text := ast.get_docstring(node))), "").split("\n")[0]
 
 
 def _options(kind: str, name: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -254,7 +108,7 @@ def _options(kind: str, name: str, overrides: Mapping[str, Any]) -> dict[str, An
 
 def _choices(kind: str, name: str) -> Iterator[Path]:
     """YAMLs of that name: the package's own where an entry point has the name, else of any plugin (a variant)."""
-    own = [conf_folder(_package(entry)) for entry in ([find(kind, name)] if _named(kind, name) else [])]
+    own = [conf_folder(top_package(entry)) for entry in ([find(kind, name)] if named(kind, name) else [])]
     for folder in own or [folder for _, folder in conf_folders()]:
         if folder and (path := folder / kind / f"{name}.yaml").is_file():
             yield path

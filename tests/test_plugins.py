@@ -9,7 +9,7 @@ from importlib.metadata import EntryPoint
 import pytest
 
 import dexgrasp
-from dexgrasp import plugins
+from dexgrasp import plugins, registry
 from dexgrasp.errors import DexgraspError
 from dexgrasp.hand import Hand
 
@@ -40,20 +40,20 @@ class Distribution:
 
 
 def entry(kind, name, value, distribution="dexgrasp-theirs"):
-    return EntryPoint(name=name, value=value, group=plugins.GROUPS[kind])._for(Distribution(distribution))
+    return EntryPoint(name=name, value=value, group=registry.GROUPS[kind])._for(Distribution(distribution))
 
 
 @pytest.fixture
-def registry(monkeypatch):
+def register(monkeypatch):
     """Add entry points to those that are installed."""
 
     def add(*extra):
-        real = plugins.entry_points
+        real = registry.entry_points
 
         def entry_points(group):
             return [*real(group=group), *(e for e in extra if e.group == group)]
 
-        monkeypatch.setattr(plugins, "entry_points", entry_points)
+        monkeypatch.setattr(registry, "entry_points", entry_points)
 
     return add
 
@@ -99,10 +99,10 @@ def test_installed_plugins_are_listed_without_importing_any():
     )
     done = run("-c", code)
     assert done.returncode == 0, done.stderr
-    for plugin in plugins.installed():
+    for plugin in registry.installed():
         line = next(line for line in done.stdout.splitlines() if line.split()[:2] == [plugin.kind, plugin.name])
         assert plugin.distribution in line and plugin.summary in line
-    assert {"barrett"} <= set(plugins.names("hand"))
+    assert {"barrett"} <= set(registry.names("hand"))
 
 
 def test_installed_hands_load_by_name_and_take_overrides():
@@ -126,21 +126,23 @@ def test_representations_and_backbones_load_with_options():
 )
 def test_unknown_names_say_what_was_meant_and_what_is_there(kind, wrong, right):
     with pytest.raises(DexgraspError) as caught:
-        plugins.find(kind, wrong)
+        registry.find(kind, wrong)
     assert f"did you mean {right!r}" in str(caught.value)
-    assert all(name in caught.value.expected for name in plugins.names(kind))
+    assert all(name in caught.value.expected for name in registry.names(kind))
     with pytest.raises(DexgraspError, match="did you mean"):
-        {"hand": plugins.load_hand, "backbone": plugins.load_backbone}.get(kind, lambda n: plugins.find(kind, n))(wrong)
+        {"hand": plugins.load_hand, "backbone": plugins.load_backbone}.get(kind, lambda n: registry.find(kind, n))(
+            wrong
+        )
 
 
 def test_unknown_kinds_are_refused():
     with pytest.raises(DexgraspError, match="hand, repr, backbone"):
-        plugins.names("gripper")
+        registry.names("gripper")
 
 
-def test_a_broken_plugin_is_named_and_the_others_work(registry, package):
+def test_a_broken_plugin_is_named_and_the_others_work(register, package):
     package("dexgrasp_theirs", {"__init__.py": "import no_such_module\n"})
-    registry(entry("backbone", "theirs", "dexgrasp_theirs:Net"), entry("backbone", "gone", "dexgrasp_gone:Net"))
+    register(entry("backbone", "theirs", "dexgrasp_theirs:Net"), entry("backbone", "gone", "dexgrasp_gone:Net"))
     with pytest.raises(DexgraspError) as caught:
         plugins.load_backbone("theirs")
     for part in ("'theirs'", "dexgrasp-theirs", "ModuleNotFoundError", "no_such_module"):
@@ -148,48 +150,48 @@ def test_a_broken_plugin_is_named_and_the_others_work(registry, package):
     with pytest.raises(DexgraspError, match="dexgrasp_gone"):
         plugins.load_backbone("gone")
     assert plugins.load_backbone("pointnet").channels > 0
-    listed = {plugin.name: plugin.summary for plugin in plugins.installed("backbone")}
+    listed = {plugin.name: plugin.summary for plugin in registry.installed("backbone")}
     assert "broken" in listed["gone"] and "pointnet" in listed
 
 
-def test_a_missing_attribute_is_a_broken_plugin(registry):
-    registry(entry("backbone", "theirs", "dexgrasp_pointnet:Nothing"))
+def test_a_missing_attribute_is_a_broken_plugin(register):
+    register(entry("backbone", "theirs", "dexgrasp_pointnet:Nothing"))
     with pytest.raises(DexgraspError, match="AttributeError"):
         plugins.load_backbone("theirs")
 
 
 @pytest.mark.parametrize("value", ["collections:OrderedDict", "math:pi"])
 @pytest.mark.parametrize("kind", ["hand", "repr", "backbone"])
-def test_a_plugin_of_the_wrong_type_is_refused(registry, kind, value):
-    registry(entry(kind, "theirs", value))
+def test_a_plugin_of_the_wrong_type_is_refused(register, kind, value):
+    register(entry(kind, "theirs", value))
     with pytest.raises(DexgraspError, match="subclass of dexgrasp") as caught:
-        plugins.load_class(kind, "theirs")
+        registry.load_class(kind, "theirs")
     assert "dexgrasp-theirs" in str(caught.value)
 
 
-def test_an_unfinished_plugin_is_refused(registry, package):
+def test_an_unfinished_plugin_is_refused(register, package):
     package("dexgrasp_theirs", {"__init__.py": "from dexgrasp.backbone import Backbone\nclass Net(Backbone): pass\n"})
-    registry(entry("backbone", "theirs", "dexgrasp_theirs:Net"))
+    register(entry("backbone", "theirs", "dexgrasp_theirs:Net"))
     with pytest.raises(DexgraspError, match=r"abstract methods: forward, plan"):
         plugins.load_backbone("theirs")
 
 
-def test_two_distributions_with_one_name_matter_only_when_asked_for(registry):
-    registry(entry("hand", "twice", "one_package", "first"), entry("hand", "twice", "other_package", "second"))
+def test_two_distributions_with_one_name_matter_only_when_asked_for(register):
+    register(entry("hand", "twice", "one_package", "first"), entry("hand", "twice", "other_package", "second"))
     with pytest.raises(DexgraspError) as caught:
         plugins.load_hand("twice")
     assert "first (one_package)" in str(caught.value) and "second (other_package)" in str(caught.value)
     assert plugins.load_hand("barrett").name == "barrett"
-    assert [p.distribution for p in plugins.installed("hand") if p.name == "twice"] == ["first", "second"]
+    assert [p.distribution for p in registry.installed("hand") if p.name == "twice"] == ["first", "second"]
 
 
-def test_the_same_entry_point_found_twice_is_one(registry):
+def test_the_same_entry_point_found_twice_is_one(register):
     same = entry("hand", "theirs", "dexgrasp_theirs")
-    registry(same, same)
-    assert plugins.find("hand", "theirs") == same
+    register(same, same)
+    assert registry.find("hand", "theirs") == same
 
 
-def test_a_hand_is_a_package_with_yaml_and_urdf(registry, package):
+def test_a_hand_is_a_package_with_yaml_and_urdf(register, package):
     package(
         "dexgrasp_theirs",
         {
@@ -199,7 +201,7 @@ def test_a_hand_is_a_package_with_yaml_and_urdf(registry, package):
             "theirs.urdf": HAND_URDF,
         },
     )
-    registry(entry("hand", "theirs", "dexgrasp_theirs"))
+    register(entry("hand", "theirs", "dexgrasp_theirs"))
     hand = plugins.load_hand("theirs")
     assert isinstance(hand, Hand) and hand.name == "theirs" and hand.joint_names == ("left_joint", "right_joint")
     wide = plugins.load_hand("theirs_wide")
@@ -207,9 +209,9 @@ def test_a_hand_is_a_package_with_yaml_and_urdf(registry, package):
     assert "dexgrasp_theirs" not in sys.modules
 
 
-def test_a_hand_package_without_its_yaml_says_so(registry, package):
+def test_a_hand_package_without_its_yaml_says_so(register, package):
     package("dexgrasp_theirs", {"__init__.py": ""})
-    registry(entry("hand", "theirs", "dexgrasp_theirs"))
+    register(entry("hand", "theirs", "dexgrasp_theirs"))
     with pytest.raises(DexgraspError, match=r"conf/hand/theirs.yaml"):
         plugins.load_hand("theirs")
 
@@ -249,15 +251,15 @@ def test_packages_are_found_without_importing(package):
     folder = package(
         "dexgrasp_theirs", {"__init__.py": "raise RuntimeError\n", "sub/__init__.py": "raise RuntimeError\n"}
     )
-    assert plugins.package_folder("dexgrasp_theirs") == folder
-    assert plugins.package_folder("dexgrasp_theirs.sub") == folder / "sub"
-    assert plugins.package_folder("dexgrasp_nowhere") is None and plugins.package_folder("dexgrasp_theirs.no") is None
+    assert registry.package_folder("dexgrasp_theirs") == folder
+    assert registry.package_folder("dexgrasp_theirs.sub") == folder / "sub"
+    assert registry.package_folder("dexgrasp_nowhere") is None and registry.package_folder("dexgrasp_theirs.no") is None
 
 
-def test_our_configs_come_before_a_strangers(registry, package):
+def test_our_configs_come_before_a_strangers(register, package):
     package("aaa_theirs", {"__init__.py": "", "conf/hand/barrett.yaml": "name: barrett\nurdf: nowhere\n"})
-    registry(entry("hand", "theirs", "aaa_theirs"))
-    found = [name for name, _ in plugins.conf_folders()]
+    register(entry("hand", "theirs", "aaa_theirs"))
+    found = [name for name, _ in registry.conf_folders()]
     assert found[-1] == "aaa_theirs" and len(found) == len(set(found))
 
 

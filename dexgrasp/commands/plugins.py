@@ -5,16 +5,16 @@ import argparse
 from rich.console import Console
 from rich.table import Table
 
-from dexgrasp import plugins
+from dexgrasp import registry
 
 
 def main(argv: list[str]) -> int:
     """Print kind, name, distribution and one line for every installed plugin."""
     parser = argparse.ArgumentParser(prog="dexgrasp plugins", description=__doc__)
-    parser.add_argument("kind", nargs="?", choices=list(plugins.GROUPS), help="only this kind")
+    parser.add_argument("kind", nargs="?", choices=list(registry.GROUPS), help="only this kind")
     kind = parser.parse_args(argv).kind
     table = Table("kind", "name", "distribution", "what it is", box=None, header_style="bold", pad_edge=False)
-    for plugin in plugins.installed(kind):
+    for plugin in registry.installed(kind):
         table.add_row(plugin.kind, plugin.name, plugin.distribution, plugin.summary)
     console = Console()
     if not console.is_terminal:
