@@ -23,14 +23,10 @@ def planes(part: trimesh.Trimesh) -> np.ndarray:
     return np.column_stack([normals, offsets])[np.sort(first)]
 
 
-def inscribed_balls(
-    parts: Sequence[trimesh.Trimesh], tolerance: float, extra: np.ndarray | None = None
-) -> tuple[np.ndarray, int]:
+def inscribed_balls(parts: Sequence[trimesh.Trimesh], tolerance: float) -> np.ndarray:
     """Return balls (B, 4) of centre and radius (m) that fill the union of convex parts from inside its surface.
 
-    Every point of a lattice on the surface, 20 tolerances wide, lies within `tolerance` (m) of some ball. `extra` (4,)
-    is one more ball, which comes first where it lies inside a part up to a tenth of a millimetre; the second value is
-    its place in the result, or -1.
+    Every point of a lattice on the surface, 20 tolerances wide, lies within `tolerance` (m) of some ball.
     """
     bodies = [planes(part) for part in parts]
     found, surface = [], []
@@ -48,22 +44,17 @@ def inscribed_balls(
         found.append(np.column_stack([points - radius[:, None] * normals, radius]))
         surface.append(points)
     balls, touched = np.concatenate(found), np.concatenate(surface)
-    first = -1
-    if extra is not None and any((body[:, :3] @ extra[:3] + extra[3] - body[:, 3]).max() < 1e-4 for body in bodies):
-        balls, first = np.concatenate([extra[None], balls]), 0
     # Large balls first, each kept only if it reaches a point of the surface that is still bare.
     order = np.lexsort((*balls[:, :3].T, -np.round(balls[:, 3], 6)))
-    if first == 0:
-        order = np.concatenate([[0], order[order > 0]])
     near = cKDTree(touched)
     bare = np.ones(len(touched), dtype=bool)
     kept = []
     for place in order:
-        if place != first and not bare[place - (first == 0)]:
+        if not bare[place]:
             continue
         bare[near.query_ball_point(balls[place, :3], balls[place, 3] + tolerance)] = False
         kept.append(place)
-    return balls[kept], first
+    return balls[kept]
 
 
 def _lattice(part: trimesh.Trimesh, spacing: float) -> tuple[np.ndarray, np.ndarray]:
@@ -83,10 +74,9 @@ def _lattice(part: trimesh.Trimesh, spacing: float) -> tuple[np.ndarray, np.ndar
     return np.concatenate(points), np.concatenate(normals)
 
 
-def ball_tree(leaves: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return balls (M, 4), children (M, 2; -1 for a leaf) and the place of each leaf (B,) of a binary tree, root 0."""
+def ball_tree(leaves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return balls (M, 4) and children (M, 2; -1 for a leaf) of a binary tree over leaves (B, 4), root 0."""
     balls, children = np.empty((2 * len(leaves) - 1, 4)), np.full((2 * len(leaves) - 1, 2), -1)
-    places = np.empty(len(leaves), dtype=np.int64)
     stack = [(np.arange(len(leaves)), -1, 0)]
     count = 0
     while stack:
@@ -95,7 +85,7 @@ def ball_tree(leaves: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if parent >= 0:
             children[parent, side] = node
         if len(members) == 1:
-            balls[node], places[members[0]] = leaves[members[0]], node
+            balls[node] = leaves[members[0]]
             continue
         inside = leaves[members]
         low = (inside[:, :3] - inside[:, 3:]).min(axis=0)
@@ -108,4 +98,4 @@ def ball_tree(leaves: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         half = len(members) // 2
         stack.append((members[order[half:]], node, 1))
         stack.append((members[order[:half]], node, 0))
-    return balls, children, places
+    return balls, children

@@ -23,6 +23,8 @@ NEAR = 0.5
 """A bounding ball is split once the surface is nearer than this many times what splitting may gain."""
 CLOSE = 1e-3
 """Below this the grid's lower bound gives way to distances to triangles, m."""
+GRID = 4e-3
+"""Twice what the grid's lower bound may lack, m."""
 DOUBT = 5e-5
 """Allowance for triangles that a cell does not name, m; nearer than twice this the exact distance decides."""
 TIP_REACH = 1.25
@@ -242,13 +244,13 @@ def _settle(body: HandBody, field: Field, poses: np.ndarray, finger: int, stack:
     The fingertip circle where it touches; else, of all balls that lie on the surface, the one whose contact is
     nearest to their mean (k-means with one centre, and its medoid).
     """
-    tip, link = body.tip_balls[finger], body.tip_links[finger]
-    if tip >= 0:
-        x, y, z = carry(poses, link, body.balls, tip)
-        if lower_bound(field, x, y, z) - body.balls[tip, 3] < CLOSE:
-            nearest(field.tree, x, y, z, seed_at(field, x, y, z), hit)
-            if hit[0] - body.balls[tip, 3] <= 3 * TOUCH:
-                return True
+    link = body.tip_links[finger]
+    x, y, z = carry(poses, link, body.tips, finger)
+    radius = body.tips[finger, 6]
+    if abs(lower_bound(field, x, y, z) - radius) < GRID:
+        nearest(field.tree, x, y, z, seed_at(field, x, y, z), hit)
+        if abs(hit[0] - radius) <= FLAT and _on_circle(body, poses, finger, hit):
+            return True
     found = np.empty((256, 7))
     count, top = 0, 1
     stack[0] = body.roots[link]
@@ -277,6 +279,27 @@ def _settle(body: HandBody, field: Field, poses: np.ndarray, finger: int, stack:
             least, best = square, a
     hit[:] = found[best]
     return True
+
+
+@njit(cache=True)
+def _on_circle(body: HandBody, poses: np.ndarray, finger: int, hit: np.ndarray) -> bool:
+    """Whether the fingertip circle's point opposite to the normal lies on the distal link's surface."""
+    link, tip = body.tip_links[finger], body.tips[finger]
+    at = np.empty(3)
+    for j in range(3):
+        along = 0.0
+        for k in range(3):
+            along += poses[link, k, j] * hit[4 + k]
+        at[j] = tip[j] - tip[6] * along
+    least = np.inf
+    for p in range(len(body.part_links)):
+        if body.part_links[p] == link:
+            outside = -np.inf
+            for s in range(body.parts[p], body.parts[p + 1]):
+                side = body.planes[s]
+                outside = max(outside, side[0] * at[0] + side[1] * at[1] + side[2] * at[2] - side[3])
+            least = min(least, outside)
+    return abs(least) <= 2 * FLAT
 
 
 @njit(cache=True)

@@ -14,6 +14,8 @@ TIP_TOLERANCE = 1e-4
 """How closely balls follow the distal links, m."""
 TOLERANCE = 3e-4
 """How closely balls follow all other links, m."""
+STILL = 1e-9
+"""Speed of balls that do not move, such as those centred on a joint's axis, m."""
 
 
 class HandBody(NamedTuple):
@@ -66,11 +68,9 @@ class HandBody(NamedTuple):
     rates: np.ndarray
     """(F, J) joint velocities that close each finger, per unit of its closing parameter."""
     speeds: np.ndarray
-    """(F, B) bound of a ball centre's speed per unit of the closing parameter; 0 where it does not move."""
+    """(F, B) bound of a ball centre's speed per unit of the closing parameter."""
     tip_links: np.ndarray
     """(F,) distal links."""
-    tip_balls: np.ndarray
-    """(F,) the ball that is the fingertip circle; -1 where the link does not contain it."""
     tips: np.ndarray
     """(F, 7) fingertip centre, closing axis, radius, in the distal link."""
 
@@ -90,20 +90,14 @@ def _compile(hand: UrdfHand, coarseness: float) -> HandBody:
     matrix, offset = (part.numpy() for part in hand.coupling)
     limits = np.stack([hand.model.lowerPositionLimit, hand.model.upperPositionLimit], axis=1)
     rates = np.array([[finger.closing.get(joint, 0.0) for joint in hand.joint_names] for finger in hand.fingers])
-    balls, children, roots, links, tip_balls = [], [], np.full(len(names), -1), [], np.full(len(hand.fingers), -1)
+    balls, children, roots, links = [], [], np.full(len(names), -1), []
     count = 0
     for link, name in enumerate(names):
         if not hand.collisions.get(name):
             continue
-        finger = next((number for number, finger in enumerate(hand.fingers) if finger.link == name), None)
-        circle = None
-        if finger is not None:
-            circle = np.array([*hand.fingers[finger].tip_center.tolist(), hand.fingers[finger].tip_radius])
-        tolerance = coarseness * (TOLERANCE if finger is None else TIP_TOLERANCE)
-        leaves, first = inscribed_balls(hand.collisions[name], tolerance, circle)
-        nodes, below, places = ball_tree(leaves)
-        if first >= 0:
-            tip_balls[finger] = count + places[first]
+        tolerance = TIP_TOLERANCE if any(finger.link == name for finger in hand.fingers) else TOLERANCE
+        leaves = inscribed_balls(hand.collisions[name], coarseness * tolerance)
+        nodes, below = ball_tree(leaves)
         roots[link] = count
         balls.append(nodes)
         children.append(np.where(below < 0, -1, below + count))
@@ -144,7 +138,6 @@ def _compile(hand: UrdfHand, coarseness: float) -> HandBody:
         rates=rates,
         speeds=np.zeros((len(rates), count)),
         tip_links=np.array([names.index(finger.link) for finger in hand.fingers]),
-        tip_balls=tip_balls,
         tips=np.array([[*f.tip_center.tolist(), *f.closing_axis.tolist(), f.tip_radius] for f in hand.fingers]),
     )
     for finger, rate in enumerate(rates @ matrix.T):
@@ -187,7 +180,7 @@ def _speeds(body: HandBody, rate: np.ndarray, link_of: np.ndarray) -> np.ndarray
                     reach = reach + np.abs(body.limits[body.drives[joint]]).max()
                 reach = reach + np.linalg.norm(body.placements[joint, :, 3])
             joint = body.parents[joint]
-    return speeds
+    return np.maximum(speeds, STILL)
 
 
 @njit(cache=True, error_model="numpy")

@@ -120,7 +120,10 @@ def test_contacts_in_the_flexion_plane_lie_on_the_fingertip_circle(hand, closer)
     actual = (pose[:, None] @ hand.fingertips(closure.joints))[tip, 2, :3, 3]
     arc = (closure.normals[tip, 2] @ torch.tensor([1.0, 0, 0]).double()).abs() < 1e-6
     assert arc.all()
-    assert (circle - actual).norm(dim=1).median() < 2e-4
+    miss = (circle - actual).abs()
+    assert miss[:, 1:].norm(dim=1).median() < 2e-4
+    # A crowned tip touches at its body's middle plane, which is 0.6 mm beside the joint's.
+    assert miss[:, 0].median() < 8e-4
 
 
 def test_coupled_joints_follow_and_limits_hold(hand, closer):
@@ -166,8 +169,7 @@ def test_batch_and_dtype_do_not_matter(closer):
 
 def test_balls_fill_a_box_from_inside():
     box = trimesh.creation.box((0.02, 0.03, 0.05))
-    balls, first = inscribed_balls([box], 1e-4, np.array([0.0, 0, 0, 0.0099]))
-    assert first == 0
+    balls = inscribed_balls([box], 1e-4)
     half = np.array([0.01, 0.015, 0.025])
     assert (np.abs(balls[:, :3]) + balls[:, 3:] - half).max() < 5e-5
     surface = trimesh.sample.sample_surface(box, 500, seed=0)[0]
@@ -177,8 +179,9 @@ def test_balls_fill_a_box_from_inside():
 
 def test_a_ball_tree_bounds_its_leaves():
     leaves = np.random.default_rng(0).uniform(size=(37, 4)) * [0.1, 0.1, 0.1, 0.01]
-    balls, children, places = ball_tree(leaves)
-    np.testing.assert_array_equal(balls[places], leaves)
+    balls, children = ball_tree(leaves)
+    held = balls[children[:, 0] < 0]
+    np.testing.assert_array_equal(held[np.lexsort(held.T)], leaves[np.lexsort(leaves.T)])
     for node in range(len(balls)):
         below, stack = [], [node]
         while stack:
