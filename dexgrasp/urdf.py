@@ -38,7 +38,7 @@ class UrdfHand(Hand):
             `outer_joint` (link coordinates).
         shared: independent joints that are main joints of every finger.
         palm: a link whose frame is the palm frame, or {origin, approach} in the base frame.
-        variant: which of several URDFs `urdf` was composed from; kept for the record.
+        model: nothing but a key that the YAML's `urdf` may be composed from, where a hand comes in several models.
 
     Raises:
         DexgraspError: a file, link, joint or number that is missing or wrong.
@@ -52,9 +52,9 @@ class UrdfHand(Hand):
         *,
         shared: Sequence[str] = (),
         palm: str | Mapping[str, Sequence[float]] | None = None,
-        variant: str | None = None,
+        model: str | None = None,
     ) -> None:
-        self.name, self.urdf, self.variant = name, Path(urdf), variant
+        self.name, self.urdf = name, Path(urdf)
         robot = _parse(self.urdf)
         self._joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
         self._check_mimics()
