@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import joblib
-import manifold3d
 import numpy as np
 import trimesh
-from scipy.ndimage import binary_fill_holes, distance_transform_edt
 
 from dexgrasp.convex import convex_parts
 from dexgrasp.errors import DexgraspError
 from dexgrasp.objects import Object
+from dexgrasp.repair import joined, manifold, repaired
 
 log = logging.getLogger(__name__)
 
@@ -186,6 +185,8 @@ def check_mesh(mesh: trimesh.Trimesh, repair: bool = False) -> tuple[trimesh.Tri
         if not repair:
             raise Skip("not watertight; objects.repair=true closes it and reports the deviation")
         mesh, moved = repaired(mesh)
+        if not mesh.is_volume:
+            raise Skip("not watertight, and could not be repaired")
         notes.append(f"repaired: surface moved {1e3 * moved:.2f} mm (p95)")
     if not mesh.is_winding_consistent:
         trimesh.repair.fix_winding(mesh)
@@ -197,7 +198,7 @@ def check_mesh(mesh: trimesh.Trimesh, repair: bool = False) -> tuple[trimesh.Tri
     if len(outer) > 1:
         if not _touching(outer):
             raise Skip(f"{len(outer)} separate bodies; one rigid body is expected")
-        mesh = _joined(outer)
+        mesh = joined(outer)
         notes.append(f"{len(outer)} overlapping bodies joined")
     if not mesh.is_volume or mesh.volume < 1e-9:
         raise Skip("its surface does not enclose a volume")
@@ -219,70 +220,5 @@ def _touching(bodies: Sequence[trimesh.Trimesh]) -> bool:
 def _near(a: trimesh.Trimesh, b: trimesh.Trimesh, gap: float = 5e-4) -> bool:
     if (a.bounds[0] - gap > b.bounds[1]).any() or (b.bounds[0] - gap > a.bounds[1]).any():
         return False
-    first, second = (_manifold(body) for body in (a, b))
+    first, second = (manifold(body) for body in (a, b))
     return float(first.min_gap(second, 2 * gap)) < gap
-
-
-def _manifold(mesh: trimesh.Trimesh) -> manifold3d.Manifold:
-    return manifold3d.Manifold(manifold3d.Mesh64(np.array(mesh.vertices, dtype=float), mesh.faces.astype(np.uint64)))
-
-
-def _joined(bodies: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """The union's surface: bodies that overlap would count their common volume twice."""
-    return _surface(manifold3d.Manifold.batch_boolean([_manifold(body) for body in bodies], manifold3d.OpType.Add))
-
-
-def _surface(body: manifold3d.Manifold) -> trimesh.Trimesh:
-    surface = body.to_mesh64()
-    faces = np.asarray(surface.tri_verts).astype(np.int64)
-    return trimesh.Trimesh(np.asarray(surface.vert_properties)[:, :3], faces, process=False)
-
-
-def repaired(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, float]:
-    """Return a closed version of an open mesh and how far its surface moved (m, 95th percentile, both ways).
-
-    Holes are filled where that is enough; else the outside is rebuilt from voxels of 1/96 of the extent (an open
-    vessel then gets a wall as thick as a voxel). Raises Skip where neither encloses a volume.
-    """
-    mended = mesh.copy()
-    mended.update_faces(mended.unique_faces())
-    trimesh.repair.fill_holes(mended)
-    trimesh.repair.fix_normals(mended)
-    if not mended.is_volume:
-        mended = _remeshed(mesh)
-    if not mended.is_volume:
-        raise Skip("not watertight, and could not be repaired")
-    forth = trimesh.sample.sample_surface(mesh, 4000, seed=0)[0]
-    back = trimesh.sample.sample_surface(mended, 4000, seed=0)[0]
-    moved = [_distance(mended, forth), _distance(mesh, back)]
-    return mended, float(max(np.percentile(side, 95) for side in moved))
-
-
-def _distance(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
-    return np.abs(trimesh.proximity.closest_point(mesh, points)[1])
-
-
-def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The surface's shell of voxels, its inside filled, as a smooth closed mesh."""
-    pitch = float(mesh.extents.max()) / 96
-    grid = mesh.voxelized(pitch)
-    solid = np.pad(binary_fill_holes(grid.matrix), 3)
-    origin = grid.translation - 3 * pitch
-    field = pitch * (distance_transform_edt(solid) - distance_transform_edt(~solid)) - 0.5 * pitch
-    top = origin + pitch * (np.array(solid.shape) - 1.001)
-    # Plain floats and one flat list: the level set asks for one point at a time, some 10^5 of them.
-    values, (_, ny, nz), (ox, oy, oz) = field.ravel().tolist(), solid.shape, origin.tolist()
-    last = [size - 2 for size in solid.shape]
-
-    def inside(x: float, y: float, z: float) -> float:
-        fx, fy, fz = (x - ox) / pitch, (y - oy) / pitch, (z - oz) / pitch
-        i, j, k = (min(max(int(f), 0), most) for f, most in zip((fx, fy, fz), last, strict=True))
-        fx, fy, fz = fx - i, fy - j, fz - k
-        here = (i * ny + j) * nz + k
-        lines = [
-            values[at] * (1 - fz) + values[at + 1] * fz
-            for at in (here, here + nz, here + ny * nz, here + (ny + 1) * nz)
-        ]
-        return (lines[0] * (1 - fy) + lines[1] * fy) * (1 - fx) + (lines[2] * (1 - fy) + lines[3] * fy) * fx
-
-    return _surface(manifold3d.Manifold.level_set(inside, [*origin, *top], 1.5 * pitch))
