@@ -46,6 +46,7 @@ def picture(
         meshes.append(plane.apply_translation([0, 0, -0.001]))
         colours.append(FLOOR)
     scene = trimesh.util.concatenate(meshes)
+    assert isinstance(scene, trimesh.Trimesh)
     faces = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
     intersector = RayMeshIntersector(scene, scale_to_box=False)
     hit = intersector.intersects_first(origins, rays)

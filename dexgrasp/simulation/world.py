@@ -47,7 +47,7 @@ class World:
         self._owner[roots == 0] = TABLE
         for number, body in enumerate(self._bodies):
             self._owner[roots == body] = number
-        self.present = np.ones(len(objects), dtype=bool)
+        self.present: NDArray[np.bool_] = np.ones(len(objects), dtype=bool)
         if hand is not None:
             names = [f"hand/{joint}" for joint in hand.joint_names]
             self.full_qpos = [self.model.joint(f"hand/{joint}").qposadr[0] for joint in hand.full_joint_names]  # type: ignore[attr-defined]
@@ -59,7 +59,7 @@ class World:
     def reset(self, poses: Array) -> None:
         """Put the objects at `poses` (O, 4, 4), world_T_object, at rest; NaN ones are taken away."""
         mujoco.mj_resetData(self.model, self.data)
-        self.present = np.isfinite(poses).all(axis=(1, 2))
+        self.present = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
         for number, (pose, there) in enumerate(zip(poses, self.present, strict=True)):
             at = self._qpos[number]
             self.model.body_gravcomp[self._bodies[number]] = 0.0 if there else 1.0
@@ -87,7 +87,7 @@ class World:
         result = np.full((len(self._bodies), 4, 4), np.nan)
         for number in np.flatnonzero(self.present):
             result[number] = np.eye(4)
-            body, at = self._bodies[number], self._qpos[number]
+            at = self._qpos[number]
             rotation = np.empty(9)
             mujoco.mju_quat2Mat(rotation, self.data.qpos[at + 3 : at + 7])
             result[number, :3, :3] = rotation.reshape(3, 3)

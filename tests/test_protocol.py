@@ -1,0 +1,53 @@
+"""Protocols: METHOD's numbers, and errors for YAML that is not one."""
+
+import copy
+
+import pytest
+import yaml
+
+from dexgrasp.config import conf_folder
+from dexgrasp.errors import DexgraspError
+from dexgrasp.simulation.protocol import load_protocol
+
+
+@pytest.fixture
+def config() -> dict:
+    return yaml.safe_load((conf_folder() / "protocol" / "lift-v1.yaml").read_text())
+
+
+def test_lift_v1_is_method_section_5() -> None:
+    protocol = load_protocol("lift-v1")
+    physics, motion = protocol.physics, protocol.motion
+    assert (physics.friction, physics.torsional_friction, physics.density) == (0.6, 0.02, 500)
+    assert (physics.mass_min, physics.mass_max, motion.lift, motion.hold) == (0.05, 1, 0.30, 2)
+    assert str(protocol) == "lift-v1 (version 1)"
+
+
+def test_cmgnet_code_is_method_section_5() -> None:
+    protocol = load_protocol("cmgnet-code")
+    assert (protocol.physics.friction, protocol.physics.mass_min, protocol.physics.mass_max) == (100, 0.001, 0.001)
+    assert protocol.motion.overdrive == pytest.approx(0.0872665, abs=1e-6)
+    assert (protocol.motion.lift, protocol.verdict.rise, protocol.verdict.max_tilt) == (0.2, 0.133, 30)
+    assert protocol.verdict.stop_at == 1
+
+
+def test_wrong_keys_and_values_are_told(config: dict) -> None:
+    def fails(change, words: str) -> None:
+        wrong = copy.deepcopy(config)
+        change(wrong)
+        with pytest.raises(DexgraspError, match=words):
+            load_protocol(wrong)
+
+    load_protocol(config)
+    fails(lambda c: c["physics"].update(fricton=1), "fricton")
+    fails(lambda c: c["motion"].pop("lift"), "lift")
+    fails(lambda c: c["motion"].update(lift="high"), "motion.lift")
+    fails(lambda c: c["physics"].update(friction=-1.0), "physics.friction")
+    fails(lambda c: c["physics"].update(gravity=float("nan")), "physics.gravity")
+    fails(lambda c: c["verdict"].update(exclusive=1), "verdict.exclusive")
+    fails(lambda c: c.update(motion=3), "motion")
+
+
+def test_unknown_name_lists_the_known() -> None:
+    with pytest.raises(DexgraspError, match="lift-v1"):
+        load_protocol("lift-v9")
