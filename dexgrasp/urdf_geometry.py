@@ -1,5 +1,8 @@
 """Visual and collision geometry of a URDF as trimeshes in link coordinates."""
 
+import logging
+import os
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -7,6 +10,8 @@ import numpy as np
 import trimesh
 
 from dexgrasp.errors import DexgraspError
+
+logger = logging.getLogger(__name__)
 
 LARGEST_EXTENT = 2.0
 """No hand's link is longer (m): such a mesh is in millimetres."""
@@ -29,26 +34,54 @@ def link_meshes(robot: ElementTree.Element, tag: str, urdf: Path) -> dict[str, l
     return meshes
 
 
-def _numbers(text: str | None, default: str) -> np.ndarray:
-    return np.array([float(word) for word in (text or default).split()])
+def convex(mesh: trimesh.Trimesh, link: str) -> trimesh.Trimesh:
+    """Return a collision mesh, or its convex hull where it is not convex (the log says by how much it grows)."""
+    if mesh.is_convex:
+        return mesh
+    hull = mesh.convex_hull
+    if mesh.is_watertight and mesh.volume > 0:
+        logger.info(
+            "link %s: a collision mesh of %.1f cm3 is not convex; its hull of %.1f cm3 stands for it",
+            link, mesh.volume * 1e6, hull.volume * 1e6,
+        )  # fmt: skip
+    return hull
+
+
+def joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Return meshes as one."""
+    whole = trimesh.util.concatenate(list(meshes))
+    assert isinstance(whole, trimesh.Trimesh)
+    return whole
+
+
+def numbers(element: ElementTree.Element | None, key: str, default: str, count: int = 3) -> np.ndarray:
+    """Return `count` finite numbers of an attribute of a URDF element."""
+    text = default if element is None else element.get(key, default)
+    try:
+        values = np.array([float(word) for word in text.split()])
+    except ValueError:
+        values = np.array([])
+    if len(values) != count or not np.isfinite(values).all():
+        tag = "element" if element is None else f"<{element.tag}>"
+        raise DexgraspError(f"{count} finite number(s) as {key!r} of {tag}", repr(text), "correct the URDF")
+    return values
 
 
 def _origin(element: ElementTree.Element | None) -> np.ndarray:
-    if element is None:
-        return np.eye(4)
-    roll, pitch, yaw = _numbers(element.get("rpy"), "0 0 0")
+    roll, pitch, yaw = numbers(element, "rpy", "0 0 0")
     matrix = trimesh.transformations.euler_matrix(roll, pitch, yaw, "sxyz")
-    matrix[:3, 3] = _numbers(element.get("xyz"), "0 0 0")
+    matrix[:3, 3] = numbers(element, "xyz", "0 0 0")
     return matrix
 
 
 def _shape(shape: ElementTree.Element, urdf: Path, link: str) -> trimesh.Trimesh:
     if shape.tag == "box":
-        return trimesh.creation.box(_numbers(shape.get("size"), ""))
+        return trimesh.creation.box(numbers(shape, "size", ""))
     if shape.tag == "cylinder":
-        return trimesh.creation.cylinder(float(shape.get("radius", 0)), float(shape.get("length", 0)), sections=32)
+        radius, length = (float(numbers(shape, key, "", 1)[0]) for key in ("radius", "length"))
+        return trimesh.creation.cylinder(radius, length, sections=32)
     if shape.tag == "sphere":
-        return trimesh.creation.icosphere(2, float(shape.get("radius", 0)))
+        return trimesh.creation.icosphere(2, float(numbers(shape, "radius", "", 1)[0]))
     if shape.tag == "mesh":
         return _mesh(shape, urdf, link)
     raise DexgraspError(
@@ -73,7 +106,7 @@ def _mesh(shape: ElementTree.Element, urdf: Path, link: str) -> trimesh.Trimesh:
     mesh = mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise DexgraspError(f"a mesh with faces for link {link!r}", f"none in {path}", "export it again")
-    mesh.apply_scale(_numbers(shape.get("scale"), "1 1 1"))
+    mesh.apply_scale(numbers(shape, "scale", "1 1 1"))
     if not np.isfinite(mesh.vertices).all() or mesh.extents.max() > LARGEST_EXTENT:
         raise DexgraspError(
             f"the mesh of link {link!r} in metres (at most {LARGEST_EXTENT:g} m long)",
@@ -86,12 +119,14 @@ def _mesh(shape: ElementTree.Element, urdf: Path, link: str) -> trimesh.Trimesh:
 def find_mesh(name: str, urdf: Path) -> Path | None:
     """Return the file of a mesh name: relative, absolute, file:// or package://; None if there is none.
 
-    `package://name/rest` is looked up as `name/rest` and as `rest` in every folder above the URDF.
+    `package://name/rest` is looked up as `name/rest` and as `rest` in every folder above the URDF and in those
+    of ROS_PACKAGE_PATH.
     """
     if name.startswith("package://"):
         rest = name.removeprefix("package://")
         inside = rest.partition("/")[2]
-        candidates = [folder / tail for folder in urdf.resolve().parents for tail in (rest, inside)]
+        known = [Path(folder) for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
+        candidates = [folder / tail for folder in [*urdf.resolve().parents, *known] for tail in (rest, inside)]
     else:
         candidates = [urdf.parent / name.removeprefix("file://")]
     return next((path for path in candidates if path.is_file()), None)

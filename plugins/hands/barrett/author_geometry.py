@@ -55,12 +55,13 @@ def upright(solid: Manifold) -> Manifold:
 
 
 def knuckle_head() -> tuple[Manifold, Manifold]:
-    """Return head of a knuckle (frame of the spread joint) and the slot in it."""
+    """Return head of a knuckle (frame of the spread joint), and what is cut from it: slot and cable bore."""
     joint = np.array([-50.0, 33.9])
     foot = [(-27, 24.8), (-27, 0), (-50, 0.3), (-63.3, 7.2), (-65, 10)]
     head = upright(prism(hull(disc(joint, 15.0), foot), -12.3, 12.3, 1.3))
     room = hull(disc(joint, 14.0), [(-70, 22), (-70, 60), (-30.5, 60), (-30.5, 30.8)])
-    return head, upright(prism(room, -SLOT[1], -SLOT[0]))
+    cable = Manifold.cylinder(25, 3.2, 3.2, 24).rotate([0, -90, 0]).translate([-41, -0.8, 4])
+    return head, upright(prism(room, -SLOT[1], -SLOT[0])) + cable
 
 
 def knuckle_arm(step: float) -> Manifold:
@@ -102,11 +103,12 @@ def placed_knuckle(model: str) -> tuple[Manifold, Manifold]:
 
 
 def base(model: str) -> Manifold:
-    """Return the palm: parts joined, bores of the spread joints and finger 3's slot cut."""
+    """Return the palm: parts joined; bores of the spread joints, finger 3's slot and the cable socket cut."""
     solid = Manifold.batch_boolean(base_parts(model), OpType.Add)
     bores = [Manifold.cylinder(6, 9.3, 9.3, 40).translate([x, 0, DECK[model] - 5]) for x in (-25, 25)]
     _, room = placed_knuckle(model)
-    return solid - bores[0] - bores[1] - room
+    socket = Manifold.cube([13, 8, 4.3]).translate([-6.5, -46, 10.9])
+    return solid - bores[0] - bores[1] - room - socket
 
 
 def knuckle() -> Manifold:
