@@ -16,7 +16,7 @@ def test_near_hides_far_and_right_is_right() -> None:
     red, green, blue = image[30, 40]
     assert red > 60 and green == blue == 0
     near[0, 3] = 0.2
-    columns = np.flatnonzero((picture([(box, near, (1, 0, 0))], camera, (60, 80), floor=False)[30, :, 2] == 0))
+    columns = np.flatnonzero(picture([(box, near, (1, 0, 0))], camera, (60, 80), floor=False)[30, :, 2] == 0)
     assert len(columns) and columns.min() > 40
 
 
