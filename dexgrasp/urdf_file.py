@@ -23,7 +23,11 @@ class UrdfFile:
         for joint in self.joints.values():
             if joint.get("type") == "continuous":
                 _bound(joint)
+        # Before Pinocchio, which says of bad numbers only that there are some.
         self._check_mimics()
+        for name, joint in self.joints.items():
+            if joint.get("type") in ("revolute", "prismatic") and joint.find("mimic") is None:
+                self.limits(name)
 
     def model(self) -> pin.Model:
         """Return the Pinocchio model; mimic joints are ordinary ones there."""
@@ -109,6 +113,7 @@ class UrdfFile:
                         f"{kind} joint {target!r} in {self.path}",
                         "correct the <mimic> tag",
                     )
+                numbers(mimic, "multiplier", "1", 1), numbers(mimic, "offset", "0", 1)
                 seen.add(target)
                 mimic = self.joints[target].find("mimic")
 

@@ -103,12 +103,13 @@ def placed_knuckle(model: str) -> tuple[Manifold, Manifold]:
 
 
 def base(model: str) -> Manifold:
-    """Return the palm: parts joined; bores of the spread joints, finger 3's slot and the cable socket cut."""
+    """Return the palm: parts joined; bores of the spread joints, finger 3's slot and the sockets cut."""
     solid = Manifold.batch_boolean(base_parts(model), OpType.Add)
     bores = [Manifold.cylinder(6, 9.3, 9.3, 40).translate([x, 0, DECK[model] - 5]) for x in (-25, 25)]
     _, room = placed_knuckle(model)
     socket = Manifold.cube([13, 8, 4.3]).translate([-6.5, -46, 10.9])
-    return solid - bores[0] - bores[1] - room - socket
+    plug = Manifold.cube([11, 5, 12], True)
+    return solid - bores[0] - bores[1] - room - socket - plug
 
 
 def knuckle() -> Manifold:
