@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import joblib
+import numpy as np
 import torch
 from omegaconf import OmegaConf
 
@@ -22,6 +23,7 @@ from dexgrasp.dataset import stages
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.store import Item, Shard, Store, digest, lock, write_shard
 from dexgrasp.errors import DexgraspError
+from dexgrasp.hand import Hand
 from dexgrasp.objects import load_objects
 from dexgrasp.plugins import build_hand, build_representation, load_class
 from dexgrasp.progress import track
@@ -56,12 +58,12 @@ def ensure(
     """
     settings, hand = _plain(config), _plain(hand)
     told = None if representation is None else _plain(representation)
-    _check(settings, hand, told)
+    identity = _identity(hand, _check(settings, hand, told))
     root = Path(settings["root"]).expanduser().absolute()
     folders: dict[str, Path] = {}
     parent = ""
     for stage in STAGES if told else STAGES[:-1]:
-        content = _content(stage, settings, hand, told) | {"after": parent, "revision": REVISION}
+        content = _content(stage, settings, identity, told) | {"after": parent, "revision": REVISION}
         parent = digest(content)
         folder = root / f"{stage}-{parent}"
         dataset = Dataset(settings, hand, folders, told)
@@ -89,21 +91,24 @@ def table(rows: Sequence[Made]) -> str:
     return "\n".join(lines)
 
 
-def _check(settings: dict[str, Any], hand: dict[str, Any], told: dict[str, Any] | None) -> None:
-    """Find what is wrong before anything is written."""
+def _check(settings: dict[str, Any], hand: dict[str, Any], told: dict[str, Any] | None) -> Hand:
+    """Find what is wrong before anything is written; return the hand."""
     stages.Settings.read(settings)
     built = build_hand(hand)
     if told is not None:
         build_representation(told, built, channels=1)
+    return built
 
 
-def _content(stage: str, settings: dict[str, Any], hand: dict[str, Any], told: dict[str, Any] | None) -> dict[str, Any]:
+def _content(
+    stage: str, settings: dict[str, Any], identity: dict[str, Any], told: dict[str, Any] | None
+) -> dict[str, Any]:
     """Everything that a stage's content follows from, beside the stage before it."""
     if stage == "objects":
         return {"objects": settings["objects"], "files": _listing(settings["objects"])}
     if stage == "grasps":
         keys = ("synthesis", "approach", "seed")
-        return {"hand": _identity(hand), **{key: settings[key] for key in keys}}
+        return {"hand": identity, **{key: settings[key] for key in keys}}
     if stage == "scenes":
         return {key: settings[key] for key in ("scenes", "approach", "simulator", "seed")}
     if stage == "views":
@@ -115,14 +120,16 @@ def _content(stage: str, settings: dict[str, Any], hand: dict[str, Any], told: d
     return {"labels": settings["labels"], "representation": kept}
 
 
-def _identity(hand: dict[str, Any]) -> dict[str, Any]:
-    """A hand's config with its URDF's content in place of its path."""
-    if "urdf" not in hand:
-        return hand
-    path = Path(hand["urdf"]).expanduser()
-    if not path.is_file():
-        raise DexgraspError(f"the URDF of hand {hand.get('name')!r}", f"no file {path}", "check hand.urdf")
-    return hand | {"urdf": hashlib.sha256(path.read_bytes()).hexdigest()[:12]}
+def _identity(config: dict[str, Any], hand: Hand) -> dict[str, Any]:
+    """A hand's config with the contents of its URDF and its collision geometry in place of paths."""
+    content = hashlib.sha256()
+    for link, parts in sorted(hand.collisions.items()):
+        content.update(link.encode())
+        for part in parts:
+            content.update(np.ascontiguousarray(part.vertices, dtype=np.float32).tobytes())
+    if "urdf" in config:
+        content.update(Path(config["urdf"]).expanduser().read_bytes())
+    return {key: value for key, value in config.items() if key != "urdf"} | {"content": content.hexdigest()[:12]}
 
 
 def _listing(objects: dict[str, Any]) -> list[Any]:
