@@ -55,12 +55,14 @@ def upright(solid: Manifold) -> Manifold:
 
 
 def knuckle_head() -> tuple[Manifold, Manifold]:
-    """Return head of a knuckle (frame of the spread joint), and what is cut from it: slot and cable bore."""
+    """Return head of a knuckle (frame of the spread joint), and what is cut from it: slot and cable bores."""
     joint = np.array([-50.0, 33.9])
     foot = [(-27, 24.8), (-27, 0), (-50, 0.3), (-63.3, 7.2), (-65, 10)]
     head = upright(prism(hull(disc(joint, 15.0), foot), -12.3, 12.3, 1.3))
     room = hull(disc(joint, 14.0), [(-70, 22), (-70, 60), (-30.5, 60), (-30.5, 30.8)])
     cable = Manifold.cylinder(25, 3.2, 3.2, 24).rotate([0, -90, 0]).translate([-41, -0.8, 4])
+    for y in (-6.3, 4.7):
+        cable += Manifold.cylinder(27, 1.2, 1.2, 12).rotate([0, -90, 0]).translate([-39, y, 16.6])
     return head, upright(prism(room, -SLOT[1], -SLOT[0])) + cable
 
 
@@ -103,13 +105,15 @@ def placed_knuckle(model: str) -> tuple[Manifold, Manifold]:
 
 
 def base(model: str) -> Manifold:
-    """Return the palm: parts joined; bores of the spread joints, finger 3's slot and the sockets cut."""
+    """Return the palm: parts joined; bores of the spread joints, finger 3's slot, sockets and screw holes cut."""
     solid = Manifold.batch_boolean(base_parts(model), OpType.Add)
     bores = [Manifold.cylinder(6, 9.3, 9.3, 40).translate([x, 0, DECK[model] - 5]) for x in (-25, 25)]
     _, room = placed_knuckle(model)
     socket = Manifold.cube([13, 8, 4.3]).translate([-6.5, -46, 10.9])
     plug = Manifold.cube([11, 5, 12], True)
-    return solid - bores[0] - bores[1] - room - socket - plug
+    screws = [Manifold.cylinder(9, 1.3, 1.3, 12).rotate([0, 0, turn]).translate(
+        [30 * np.cos(np.radians(turn)), 30 * np.sin(np.radians(turn)), 0]) for turn in (0, 90, 180, 270)]  # fmt: skip
+    return Manifold.batch_boolean([solid, *bores, *screws, room, socket, plug], OpType.Subtract)
 
 
 def knuckle() -> Manifold:
