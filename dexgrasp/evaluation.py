@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dexgrasp.execution import tilted
 from dexgrasp.geometry import inverse, rotation_angle
 from dexgrasp.grasps import Grasps, Reason
 from dexgrasp.hand import Hand
@@ -100,7 +101,8 @@ def clear(
         began = time.perf_counter()
         view = look([objects[i] for i in standing], poses[standing], _seed(seed, "look", index, len(attempts)))
         looked = time.perf_counter()
-        chosen = choose(predict(view).moved(view.world_T_camera), failed, policy)
+        offered = predict(view).moved(view.world_T_camera)
+        chosen = choose(offered[~tilted(hand, offered, protocol.verdict.max_tilt)], failed, policy)
         predicted = time.perf_counter()
         seconds = {"render": looked - began, "predict": predicted - looked}
         if chosen is None:
@@ -167,8 +169,9 @@ def ceilings(
     `labels` are the feasible grasps of the scene (world frame); an object without any is not counted.
     """
     chosen: dict[str, list[Grasps]] = {"best_epsilon": [], "random": []}
+    steep = tilted(hand, labels, protocol.verdict.max_tilt)
     for row in range(len(objects)):
-        own = (labels.object == row).nonzero().flatten()
+        own = ((labels.object == row) & ~steep).nonzero().flatten()
         if len(own) == 0:
             continue
         chosen["best_epsilon"].append(labels[int(own[labels.quality[own].argmax()])])

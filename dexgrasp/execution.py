@@ -1,10 +1,12 @@
-"""How a grasp is carried out: where the hand waits before it."""
+"""How a grasp is carried out: where the hand waits before it, and from which side it comes."""
+
+import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dexgrasp.geometry import inverse
+from dexgrasp.geometry import inverse, rotate
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 
@@ -31,3 +33,11 @@ def closing_direction(hand: Hand) -> Float[Tensor, "J"]:
         for joint, rate in finger.closing.items():
             direction[hand.joint_names.index(joint)] = (rate > 0) - (rate < 0)
     return direction
+
+
+def tilted(hand: Hand, grasps: Grasps, max_tilt: float | None) -> Bool[Tensor, "N"]:
+    """Tell which grasps (z up) approach more than `max_tilt` degrees off straight down; none where it is None."""
+    if max_tilt is None:
+        return torch.zeros(len(grasps), dtype=torch.bool)
+    approach = hand.base_T_palm[:3, 2].to(grasps.pose).expand(len(grasps), 3)
+    return -rotate(grasps.pose, approach)[:, 2] < math.cos(math.radians(max_tilt))

@@ -1,10 +1,12 @@
 """The pre-grasp: straight back along the palm, fingers opened, nothing else moved."""
 
+import math
+
 import pytest
 import torch
 
 import dexgrasp
-from dexgrasp.execution import closing_direction, pregrasp
+from dexgrasp.execution import closing_direction, pregrasp, tilted
 from dexgrasp.geometry import axis_angle, inverse, pose
 from dexgrasp.grasps import Grasps
 
@@ -28,3 +30,15 @@ def test_stands_back_along_the_palm_with_open_fingers(hand) -> None:
 
 def test_closing_direction_names_the_closing_joints(hand) -> None:
     assert closing_direction(hand).tolist() == [0, 1, 1, 1]
+
+
+def test_tilt_is_measured_from_straight_down(hand) -> None:
+    down = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+    poses = []
+    for degrees in (0.0, 29.0, 31.0, 90.0, 180.0):
+        turn = torch.eye(4, dtype=torch.float64)
+        turn[:3, :3] = axis_angle(torch.tensor([1.0, 0, 0]).double(), torch.tensor(math.radians(degrees)).double())
+        poses.append(turn @ down)
+    grasps = Grasps.build(torch.stack(poses), torch.zeros(5, 4).double(), 3)
+    assert tilted(hand, grasps, 30.0).tolist() == [False, False, True, True, True]
+    assert not tilted(hand, grasps, None).any()

@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dexgrasp.execution import closing_direction, pregrasp
-from dexgrasp.geometry import rotate
+from dexgrasp.execution import closing_direction, pregrasp, tilted
 from dexgrasp.grasps import Grasps, Outcomes, Reason
 from dexgrasp.hand import Hand
 from dexgrasp.objects import Object
@@ -66,7 +65,7 @@ class MujocoSimulator(Simulator):
         world = self.world(objects, hand, protocol.physics)
         initial = poses.detach().double().cpu().numpy()
         grasps = grasps.to("cpu", torch.float64)
-        skipped = _too_tilted(hand, grasps, protocol)
+        skipped = tilted(hand, grasps, protocol.verdict.max_tilt).tolist()
         before = pregrasp(hand, grasps, protocol.motion.retreat, protocol.motion.opening)
         start_pose, start_joints = (part.detach().numpy() for part in before)
         pose, joints = grasps.pose.detach().numpy(), hand.clamp(grasps.joints).detach().numpy()
@@ -90,14 +89,6 @@ class MujocoSimulator(Simulator):
                 self._worlds.popitem(last=False)
         self._worlds.move_to_end(key)
         return self._worlds[key][1]
-
-
-def _too_tilted(hand: Hand, grasps: Grasps, protocol: Protocol) -> list[bool]:
-    if protocol.verdict.max_tilt is None:
-        return [False] * len(grasps)
-    approach = hand.base_T_palm[:3, 2].double().expand(len(grasps), 3)
-    down = -rotate(grasps.pose, approach)[:, 2]
-    return (down < np.cos(np.deg2rad(protocol.verdict.max_tilt))).tolist()
 
 
 def _outcomes(results: Sequence[Result], objects: int, like: Tensor) -> Outcomes:
