@@ -31,8 +31,8 @@ def poses(count: int) -> torch.Tensor:
 
 
 def grasps(places: torch.Tensor) -> Grasps:
-    """Grasps whose base and first contact lie at `places`."""
-    pose = torch.eye(4).repeat(len(places), 1, 1)
+    """Grasps from straight above whose base and first contact lie at `places`."""
+    pose = torch.diag(torch.tensor([1.0, -1, -1, 1])).repeat(len(places), 1, 1)
     pose[:, :3, 3] = places
     made = Grasps.build(pose, torch.zeros(len(places), 4), 3, quality=1 - 0.1 * torch.arange(len(places)))
     contacts = made.contacts.clone()
@@ -104,6 +104,17 @@ def test_failed_grasp_is_passed_over():
 
 def test_protocol_that_stops_at_one_object():
     assert len(run(Script(), 3, protocol=load_protocol("cmgnet-code")).attempts) == 2
+
+
+def test_grasps_that_the_protocol_skips_are_never_chosen():
+    def sideways(view: View) -> Grasps:
+        offered = aim(view)
+        turned = offered.pose.clone()
+        turned[0, :3, :3] = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+        return offered.replace(pose=turned)
+
+    episode = run(Script(), 3, predict=sideways, protocol=load_protocol("cmgnet-code"))
+    assert [a.target for a in episode.attempts] == ["thing_1", "thing_2"]
 
 
 def test_choose():
