@@ -3,8 +3,9 @@
 import os
 import sys
 from importlib import import_module
+from pathlib import Path
 
-from dexgrasp.errors import DexgraspError
+from dexgrasp.errors import DexgraspError, room
 
 PIPELINES = {
     "dataset": "objects -> grasps -> scenes -> views -> labels",
@@ -82,14 +83,21 @@ def pipeline(command: str, arguments: list[str]) -> int:
     full = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises instead of printing and exiting: the wording is ours
     config.register()
+    words = [word for word in arguments if not word.startswith("-")]
     sys.argv = [f"dexgrasp {command}", *arguments]
     start = hydra.main(version_base="1.3", config_path=str(config.conf_folder()), config_name=command)
     try:
-        start(config.Task(command))()
+        with room("a run's folder", Path.cwd()):
+            start(config.Task(command))()
+    except config.Refused as refused:
+        assert isinstance(refused.__cause__, Exception)
+        if full:
+            raise refused.__cause__ from None
+        raise overrides.explain(refused.__cause__, command, words) from None
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         if full:
             raise
-        raise overrides.explain(error, command, [word for word in arguments if not word.startswith("-")]) from error
+        raise overrides.explain(error, command, words) from error
     finally:
         if not isinstance(sys.exception(), KeyboardInterrupt):
             config.compare(command)

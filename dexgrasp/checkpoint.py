@@ -17,7 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from dexgrasp.errors import DexgraspError
+from dexgrasp.errors import DexgraspError, room
 from dexgrasp.hand import Hand
 
 FORMAT = 1
@@ -60,6 +60,11 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def replace_file(path: Path, content: bytes) -> None:
     """Write a file by way of a temporary one, so that a crash leaves the old content or the new."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    with room(f"{len(content)} bytes", path.parent):
+        _replace(path, content)
+
+
+def _replace(path: Path, content: bytes) -> None:
     handle, name = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:

@@ -1,5 +1,8 @@
 """Hydra as the command line uses it: search path, the resolver `${package:...}`, one wrapper round every task."""
 
+import itertools
+import logging
+import shutil
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -8,12 +11,15 @@ from typing import Any
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
+from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.plugins.search_path_plugin import SearchPathPlugin
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
 
 from dexgrasp import launcher, registry
-from dexgrasp.errors import DexgraspError
+from dexgrasp.errors import DexgraspError, room
 
 
 def package(name: str) -> str:
@@ -51,6 +57,10 @@ def register() -> None:
     launcher.register()
 
 
+class Refused(BaseException):
+    """Carries an error in the user's input past Hydra, which would print a line of its own about an Exception."""
+
+
 class Task:
     """What Hydra runs: a command's `main`, found by name so that it pickles to other processes."""
 
@@ -61,25 +71,76 @@ class Task:
 
     def __call__(self, config: DictConfig) -> None:
         main: Callable[[DictConfig], None] = import_module(f"dexgrasp.commands.{self.command}").main
-        place_urdf(config)
-        main(config)
+        try:
+            with room("what a run writes", Path.cwd()):
+                place_urdf(config)
+                main(config)
+        except (DexgraspError, HydraException, OmegaConfBaseException) as error:
+            if HydraConfig.get().mode is not RunMode.RUN:  # one of several: Hydra takes note and goes on
+                raise
+            Folders.leave()
+            raise Refused from error
 
 
-class Multirun(Callback):
-    """Remembers where the runs of a multirun lie, so that they can be compared even if some have failed."""
+class Folders(Callback):
+    """Where runs write: a folder of its own for each, gone again where a run refuses its input, known for comparison.
 
-    folder: Path | None = None
+    The folder of a multirun is kept, so that its runs can be compared even if some have failed.
+    """
+
+    multirun: Path | None = None
+    made: tuple[Path, ...] = ()
+    """Folders that were not there before this run, innermost first."""
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        folder = Path(config.hydra.run.dir).absolute()
+        Folders.made = tuple(itertools.takewhile(lambda path: not path.exists(), [folder, *folder.parents]))
+        if "${now:" in str(config.hydra.run._get_node("dir")._value()) and not config.get("resume"):
+            folder = _claim(folder)
+            Folders.made = (folder, *Folders.made[1:])
+            with open_dict(config):
+                config.hydra.run.dir = str(folder)
+
+    @staticmethod
+    def leave() -> None:
+        """Take away this run's folder where it holds nothing but what every run begins with."""
+        if not Folders.made:
+            return
+        own = {".hydra", "config.yaml", f"{HydraConfig.get().job.name}.log"}
+        if {path.name for path in Folders.made[0].iterdir()} <= own:
+            root = logging.getLogger()
+            for handler in [each for each in root.handlers if isinstance(each, logging.FileHandler)]:
+                root.removeHandler(handler)
+                handler.close()
+            shutil.rmtree(Folders.made[0])
+            for folder in Folders.made[1:]:
+                if any(folder.iterdir()):
+                    break
+                folder.rmdir()
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        Multirun.folder = Path(config.hydra.sweep.dir).absolute()
+        Folders.multirun = Path(config.hydra.sweep.dir).absolute()
 
 
 def compare(command: str) -> None:
     """After a multirun, call the command's `compare(folder)` where it has one."""
-    if Multirun.folder is not None and Multirun.folder.is_dir():
+    if Folders.multirun is not None and Folders.multirun.is_dir():
         hook = getattr(import_module(f"dexgrasp.commands.{command}"), "compare", None)
         if hook is not None:
-            hook(Multirun.folder)
+            hook(Folders.multirun)
+
+
+def _claim(folder: Path) -> Path:
+    """Make a folder that nobody else has, of that name or, where two runs begin in one second, with a number."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    for number in itertools.count(1):
+        own = folder if number == 1 else folder.with_name(f"{folder.name}_{number}")
+        try:
+            own.mkdir()
+            return own
+        except FileExistsError:
+            continue
+    raise AssertionError
 
 
 def place_urdf(config: DictConfig) -> None:

@@ -1,5 +1,10 @@
 """The one exception that users are meant to read."""
 
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
 
 class DexgraspError(Exception):
     """Bad input or a broken installation, told in full.
@@ -14,3 +19,15 @@ class DexgraspError(Exception):
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
         return type(self), (self.expected, self.found, self.remedy)  # or it could not come back from a worker
+
+
+@contextmanager
+def room(what: str, folder: Path) -> Iterator[None]:
+    """Tell a full disk, or a quota that is used up, as bad input; other errors go through."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        remedy = "make room, or write elsewhere, and run again: what is done stays and is not made twice"
+        raise DexgraspError(f"room for {what} in {folder}", "the disk is full", remedy) from error

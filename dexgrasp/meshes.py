@@ -68,11 +68,12 @@ def load_folder(
     if not entries:
         raise DexgraspError(f"meshes under {root}", "none whose name is included", "change include and exclude")
     jobs = (joblib.delayed(_load)(entry, repair, threshold) for entry in entries[:count])
-    results: list[Object | tuple[str, str]] = list(joblib.Parallel(n_jobs=workers)(jobs))
-    objects = [result for result in results if isinstance(result, Object)]
-    skipped = [result for result in results if not isinstance(result, Object)]
-    for name, reason in skipped:
-        log.warning("skipped %s: %s", name, reason)
+    results: list[tuple[str, Object | None, str]] = list(joblib.Parallel(n_jobs=workers)(jobs))
+    objects = [item for _, item, _ in results if item is not None]
+    skipped = [(name, note) for name, item, note in results if item is None]
+    for name, item, note in results:
+        if note:
+            log.warning("%s %s: %s", "skipped" if item is None else "mended", name, note)
     if not objects:
         listed = "; ".join(f"{name}: {reason}" for name, reason in skipped[:5])
         raise DexgraspError(f"a usable mesh under {root}", f"{len(skipped)} skipped ({listed})", "mend what is named")
@@ -131,18 +132,18 @@ def _matches(name: str, patterns: str | Sequence[str]) -> bool:
     return any(fnmatch.fnmatch(name, pattern) for pattern in ([patterns] if isinstance(patterns, str) else patterns))
 
 
-def _load(entry: Entry, repair: bool, threshold: float) -> Object | tuple[str, str]:
-    """One object, or its name and the reason for leaving it out. Runs in a worker process."""
+def _load(entry: Entry, repair: bool, threshold: float) -> tuple[str, Object | None, str]:
+    """A name, its object, what was mended; without object the reason for leaving it out. Runs in a worker process."""
     source = str(entry.files[0])
     try:
         mesh = read_mesh(entry.files, entry.scale)
         mesh, note = check_mesh(mesh, repair)
         parts = convex_parts(mesh, threshold)
     except Skip as reason:
-        return entry.name, str(reason)
+        return entry.name, None, str(reason)
     except Exception as error:  # coacd and mesh readers raise all sorts; one bad file must not stop the rest
-        return entry.name, f"{type(error).__name__}: {error}"
-    return Object(entry.name, entry.name, mesh, parts, f"{source} ({note})" if note else source)
+        return entry.name, None, f"{type(error).__name__}: {error}"
+    return entry.name, Object(entry.name, entry.name, mesh, parts, f"{source} ({note})" if note else source), note
 
 
 def read_mesh(files: Iterable[Path], scale: float = 1.0) -> trimesh.Trimesh:

@@ -34,7 +34,7 @@ def quiet(monkeypatch):
     """Hydra starts anew each time, whatever a test before has done."""
     monkeypatch.setattr(sys, "argv", list(sys.argv))
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    monkeypatch.setattr(config.Multirun, "folder", None)
+    monkeypatch.setattr(config.Folders, "multirun", None)
     config.register()
     yield
     GlobalHydra.instance().clear()

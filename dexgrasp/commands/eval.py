@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,42 @@ from omegaconf import DictConfig, OmegaConf
 from dexgrasp.campaign import Campaign
 from dexgrasp.checkpoint import find_checkpoint, read_tensors
 from dexgrasp.dataset.pipeline import ensure
+from dexgrasp.errors import DexgraspError
 from dexgrasp.evaluation import Policy
 from dexgrasp.report import draw_attempts, rows, write_report, write_results
 from dexgrasp.selection import Selection
-from dexgrasp.simulation.protocol import load_protocol
+from dexgrasp.settings import read
+from dexgrasp.simulation.protocol import Protocol, load_protocol
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What of a config decides an evaluation, read and checked before anything is made."""
+
+    options: dict[str, Any]
+    policy: Policy
+    selection: Selection
+    protocol: Protocol
+
+    @classmethod
+    def of(cls, config: DictConfig) -> "Settings":
+        """Return the settings of a composed config; raises DexgraspError for what is wrong in it."""
+        options = OmegaConf.to_container(config.evaluation, resolve=True)
+        assert isinstance(options, dict)
+        for key in ("top_k", "drawn"):
+            if type(options[key]) is not int or options[key] < 0:
+                raise DexgraspError(f"evaluation.{key} to be a whole number", repr(options[key]), "set it so")
+        return cls(
+            {str(key): value for key, value in options.items()},
+            read(Policy, options["policy"], "evaluation.policy"),
+            read(Selection, config.selection, "selection"),
+            load_protocol(OmegaConf.to_container(config.protocol)),  # type: ignore[arg-type]
+        )
 
 
 def main(config: DictConfig) -> None:
     """Evaluate `config.model` and print where the report lies."""
+    Settings.of(config)
     folder = Path(HydraConfig.get().runtime.output_dir)
     checkpoint = find_checkpoint(config.model)
     hand = read_tensors(checkpoint)[1]["config"]["hand"]
@@ -31,16 +60,16 @@ def main(config: DictConfig) -> None:
 def evaluate(config: DictConfig, hand: Mapping[str, Any], checkpoint: Path, folder: Path) -> dict[str, Any]:
     """Make the held-out scenes where they are missing, clear them, write results and report into `folder`."""
     began = time.perf_counter()
-    options = OmegaConf.to_container(config.evaluation, resolve=True)
-    assert isinstance(options, dict)
+    settings = Settings.of(config)
+    options = settings.options
     dataset = ensure(config.evaluation.dataset, hand)
     made = time.perf_counter()
     campaign = Campaign(
         dataset=dataset,
-        protocol=load_protocol(OmegaConf.to_container(config.protocol)),  # type: ignore[arg-type]
+        protocol=settings.protocol,
         model=checkpoint.absolute(),
-        policy=Policy(**options["policy"]),
-        selection=Selection(**OmegaConf.to_container(config.selection)),  # type: ignore[arg-type]
+        policy=settings.policy,
+        selection=settings.selection,
         top_k=options["top_k"],
         seed=config.seed,
         drawn=options["drawn"],

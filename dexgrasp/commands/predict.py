@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from dexgrasp.cloud_file import read_cloud
 from dexgrasp.grasps import Grasps
 from dexgrasp.model import load_model
 from dexgrasp.report import write_results
 from dexgrasp.selection import Selection
+from dexgrasp.settings import read
 
 
 def main(config: DictConfig) -> None:
@@ -20,7 +21,7 @@ def main(config: DictConfig) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     model = load_model(config.model)
     points, normals = read_cloud(Path(config.input), config.scale)
-    selection = Selection(**OmegaConf.to_container(config.selection))  # type: ignore[arg-type]
+    selection = read(Selection, config.selection, "selection")
     began = time.perf_counter()
     grasps = model.predict(points, normals, config.top_k, selection, config.seed)
     seconds = time.perf_counter() - began

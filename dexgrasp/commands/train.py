@@ -1,6 +1,7 @@
 """python -m dexgrasp train: data, training, evaluation in physics, report."""
 
 import dataclasses
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from dexgrasp.checkpoint import FILE, check_hand, find_checkpoint, load_state, read_tensors
-from dexgrasp.commands.eval import evaluate, text
+from dexgrasp.commands.eval import Settings, evaluate, text
 from dexgrasp.comparison import compare as compare_runs
 from dexgrasp.comparison import read_run
 from dexgrasp.dataset.dataset import Dataset
@@ -19,9 +20,12 @@ from dexgrasp.dataset.samples import Samples, collect
 from dexgrasp.dataset.store import digest
 from dexgrasp.errors import DexgraspError
 from dexgrasp.model import GraspNet, build_model, save_model
+from dexgrasp.plugins import build_hand
 from dexgrasp.report import write_results
 from dexgrasp.representation import Targets
 from dexgrasp.seeds import stream
+from dexgrasp.settings import read
+from dexgrasp.training import state
 from dexgrasp.training.loop import train
 from dexgrasp.training.settings import TrainerSettings
 
@@ -34,19 +38,34 @@ def main(config: DictConfig) -> None:
     began = time.perf_counter()
     folder = Path(HydraConfig.get().runtime.output_dir)
     config = _begin(config, folder)
-    settings = TrainerSettings(**OmegaConf.to_container(config.trainer))  # type: ignore[arg-type]
+    try:
+        _run(config, folder, began)
+    except KeyboardInterrupt:
+        print(f"what is done is kept; go on with: python -m dexgrasp train resume={folder}", file=sys.stderr)
+        raise
+
+
+def _run(config: DictConfig, folder: Path, began: float) -> None:
+    settings = read(TrainerSettings, config.trainer, "trainer")
+    if config.evaluate:
+        Settings.of(config)
+    resumed = (folder / state.FILE).is_file()
+    start = None if config.init_from is None or resumed else find_checkpoint(config.init_from)
+    if start is not None:
+        check_hand(build_hand(config.hand), read_tensors(start)[1]["hand"], start)
     torch.manual_seed(int(stream(config.seed, "weights").integers(2**31)))
     dataset = ensure(config.dataset, config.hand, config.repr)
     print(table(summary(dataset)))
     model = build_model(config, dataset.config["views"]["framing"]["points"], dataset.hand)
-    _init_from(model, config.init_from)
+    if start is not None:
+        load_state(model, read_tensors(start)[0], start)
     made = time.perf_counter()
     splits = {name: samples(dataset, model, name) for name in ("train", "validation") if dataset.split(name)}
     print(f"{len(splits['train'])} views, {splits['train'].graspable:.1%} of the seed points graspable")
     collected = time.perf_counter()
     trained = train(model, splits["train"], splits.get("validation"), settings, config.seed, folder)
     if trained.interrupted:
-        print(f"interrupted after {trained.steps} steps; go on with: python -m dexgrasp train resume={folder}")
+        print(f"stopped after {trained.steps} of {settings.steps} steps", file=sys.stderr)
         raise KeyboardInterrupt
     results: dict[str, Any] = {
         "title": f"{config.hand.name}, {config.repr.name}, {config.backbone.name}, seed {config.seed}",
@@ -105,6 +124,10 @@ def _begin(config: DictConfig, folder: Path) -> DictConfig:
     """Keep the config in the run's folder, or take the one that lies there."""
     path = folder / CONFIG
     if config.resume is not None:
+        others = [each for each in HydraConfig.get().overrides.task if not each.startswith("resume=")]
+        if others:
+            remedy = f"take it away, or start anew with init_from={config.resume}"
+            raise DexgraspError(f"`resume` alone: {path} says the rest", ", ".join(others), remedy)
         if not path.is_file():
             raise DexgraspError(f"the folder of a training with {CONFIG}", f"none in {folder}", "check `resume`")
         kept = OmegaConf.load(path)
@@ -112,11 +135,3 @@ def _begin(config: DictConfig, folder: Path) -> DictConfig:
         return kept
     OmegaConf.save(config, path)
     return config
-
-
-def _init_from(model: GraspNet, source: str | None) -> None:
-    if source is not None:
-        path = find_checkpoint(source)
-        tensors, notes = read_tensors(path)
-        check_hand(model.hand, notes["hand"], path)
-        load_state(model, tensors, path)

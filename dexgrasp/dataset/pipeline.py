@@ -158,8 +158,6 @@ def _work(stage: str, dataset: Dataset) -> tuple[Callable[[], Sequence[Any]], Ca
 
 def _objects(config: Mapping[str, Any]) -> list[tuple[int, Any]]:
     found = load_objects(config["objects"])
-    for name, reason in found.skipped:
-        log.warning("object %s is left out: %s", name, reason)
     if not len(found):
         remedy = "check objects.path, or take conf/objects/procedural.yaml"
         raise DexgraspError(f"objects in {config['objects']}", "none that can be used", remedy)

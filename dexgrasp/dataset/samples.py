@@ -14,11 +14,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dexgrasp.backbone import Backbone, Plan
-from dexgrasp.errors import DexgraspError
+from dexgrasp.dataset.store import lock
+from dexgrasp.errors import DexgraspError, room
 from dexgrasp.progress import track
 from dexgrasp.representation import Targets
 
 TARGETS = tuple(Targets.__dataclass_fields__)
+Read = Callable[[int], tuple[Float[Tensor, "N 6"], Targets]]
+"""Returns cloud and targets of a view."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ class Samples:
 
 def collect(
     views: Sequence[int],
-    read: Callable[[int], tuple[Float[Tensor, "N 6"], Targets]],
+    read: Read,
     backbone: Backbone,
     folder: Path,
     label: str,
@@ -81,7 +84,16 @@ def collect(
         return Samples(folder)
     if not views:
         raise DexgraspError("at least one view to train on", "none", "make a dataset with more scenes")
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    with lock(folder):  # of several runs one collects, and the others find it done
+        if not (folder / "done.json").is_file():
+            with room("a training's samples", folder.parent):
+                _write(views, read, backbone, folder, label)
+    return Samples(folder)
+
+
+def _write(views: Sequence[int], read: Read, backbone: Backbone, folder: Path, label: str) -> None:
+    for stale in folder.parent.glob(f".{folder.name}-*"):  # of a run that was killed
+        shutil.rmtree(stale, ignore_errors=True)
     work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     try:
         arrays: dict[str, np.ndarray] = {}
@@ -91,6 +103,8 @@ def collect(
                     path = work / f"{key}.npy"
                     shape = (len(views), *value.shape)
                     arrays[key] = np.lib.format.open_memmap(path, mode="w+", dtype=value.dtype, shape=shape)
+                    with path.open("r+b") as file:  # a full disk is told now, not by a bus error when it is written
+                        os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
                 arrays[key][row] = value
         for array in arrays.values():
             array.flush()  # type: ignore[attr-defined]
@@ -100,7 +114,6 @@ def collect(
         os.replace(work, folder)
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    return Samples(folder)
 
 
 def _rows(cloud: Tensor, targets: Targets, backbone: Backbone) -> dict[str, np.ndarray]:

@@ -21,6 +21,7 @@ from dexgrasp.dataset.camera import NOTHING, TABLE, Camera, RayScene, Rendering
 from dexgrasp.dataset.normals import depth_normals
 from dexgrasp.errors import DexgraspError
 from dexgrasp.scene import View
+from dexgrasp.settings import read
 
 
 @dataclass(frozen=True)
@@ -74,10 +75,7 @@ class Sensor:
     def build(cls, config: Mapping[str, Any]) -> "Sensor":
         """Return the sensor that a `camera` config describes (keys of `Camera`, `noise`, and a `name`)."""
         values = {key: value for key, value in config.items() if key not in ("name", "noise")}
-        try:
-            return cls(Camera(**values), Noise(**config.get("noise", {})))
-        except TypeError as cause:
-            raise DexgraspError("the keys of conf/camera/d435.yaml", str(cause), "correct the camera's YAML") from cause
+        return cls(read(Camera, values, "camera"), read(Noise, config.get("noise", {}), "camera.noise"))
 
     def measure(self, rendering: Rendering, generator: np.random.Generator) -> Float[np.ndarray, "H W"]:
         """Return depth as measured: z in metres, 0 where nothing was."""

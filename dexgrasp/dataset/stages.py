@@ -1,7 +1,7 @@
 """What each stage makes: one item of a store from its number. These run in worker processes."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -21,6 +21,7 @@ from dexgrasp.grasps import Grasps
 from dexgrasp.objects import Object, object_to_tensors
 from dexgrasp.plugins import build_representation
 from dexgrasp.seeds import stream
+from dexgrasp.settings import read
 from dexgrasp.simulation.mujoco import MujocoSimulator
 
 
@@ -129,30 +130,20 @@ class Settings:
         """Return the settings of a resolved config; raises DexgraspError for unknown or missing keys."""
         scenes, views, labels = dict(config["scenes"]), config["views"], config["labels"]
         count, per_object = scenes.pop("count"), scenes.pop("grasps_per_object")
-        if count < 1 or views["per_scene"] < 0:
-            found = f"{count} scenes, {views['per_scene']} views of each"
-            raise DexgraspError("at least one scene, no negative number of views", found, "correct the dataset's YAML")
+        numbers = {"scenes.count": count, "scenes.grasps_per_object": per_object, "views.per_scene": views["per_scene"]}
+        for key, value in numbers.items():
+            least = 1 if key == "scenes.count" else 0
+            if type(value) is not int or value < least:
+                raise DexgraspError(f"dataset.{key} to be a whole number of at least {least}", repr(value), "set it so")
         return cls(
-            _build("synthesis", SynthesisSettings, config["synthesis"]),
-            _build("approach", Approach, config["approach"]),
-            _build("scenes", Clutter, scenes),
+            read(SynthesisSettings, config["synthesis"], "dataset.synthesis"),
+            read(Approach, config["approach"], "dataset.approach"),
+            read(Clutter, scenes, "dataset.scenes"),
             count,
             per_object,
             Sensor.build(config["camera"]),
-            _build("views.viewpoints", Viewpoints, views["viewpoints"]),
-            _build("views.framing", Framing, views["framing"]),
-            _build("labels.points", LabelSettings, labels["points"]),
-            _build("labels.truth", TruthSettings, labels["truth"]),
+            read(Viewpoints, views["viewpoints"], "dataset.views.viewpoints"),
+            read(Framing, views["framing"], "dataset.views.framing"),
+            read(LabelSettings, labels["points"], "dataset.labels.points"),
+            read(TruthSettings, labels["truth"], "dataset.labels.truth"),
         )
-
-
-def _build(name: str, kind: Any, config: Mapping[str, Any]) -> Any:
-    """Build a dataclass from JSON-like values, lists becoming tuples."""
-    known = [field.name for field in fields(kind)]
-    unknown = sorted(set(config) - set(known))
-    if unknown:
-        raise DexgraspError(f"keys of dataset.{name} among {known}", ", ".join(unknown), "correct or remove them")
-    try:
-        return kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in config.items()})
-    except TypeError as cause:
-        raise DexgraspError(f"all keys of dataset.{name}: {known}", str(cause), "add what is missing") from cause

@@ -6,7 +6,6 @@ writer. The manifest holds configuration, seed, sha256 and the offsets of every 
 scanning; it is rewritten (again by rename) each time a shard is added.
 """
 
-import errno
 import fcntl
 import hashlib
 import io
@@ -25,7 +24,7 @@ from typing import Any
 import safetensors.torch
 from torch import Tensor
 
-from dexgrasp.errors import DexgraspError
+from dexgrasp.errors import DexgraspError, room
 
 SCHEMA = 1
 MANIFEST = "manifest.json"
@@ -234,17 +233,12 @@ def _append(tar: tarfile.TarFile, name: str, content: bytes) -> tuple[int, int]:
 def _write_whole(path: Path, content: bytes | memoryview) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as cause:
-        temporary.unlink(missing_ok=True)
-        if cause.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        remedy = "make room or set another root, and run again: what is written stays and is not made twice"
-        raise DexgraspError(f"room for {len(content)} bytes in {path.parent}", "the disk is full", remedy) from cause
+        with room(f"{len(content)} bytes", path.parent):
+            with open(temporary, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise

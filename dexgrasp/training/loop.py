@@ -61,15 +61,22 @@ def train(
         if processes == 1:
             _run(0, 1, 0, model, samples, validation, settings, seed, folder, device, stop)
         else:
+            errors = torch.multiprocessing.get_context("spawn").SimpleQueue()
+            work = (processes, _free_port(), model, samples, validation, settings, seed, folder, device, stop)
             context = torch.multiprocessing.start_processes(
-                _run,
-                args=(processes, _free_port(), model, samples, validation, settings, seed, folder, device, stop),
+                _child,
+                args=(errors, *work),
                 nprocs=processes,
                 start_method="spawn",
                 join=False,
             )
-            while not context.join(timeout=1):
-                pass
+            try:
+                while not context.join(timeout=1):
+                    pass
+            except torch.multiprocessing.ProcessRaisedException:
+                if errors.empty():
+                    raise
+                raise errors.get() from None
     saved, notes = read_tensors(folder / state.FILE)
     model.load_state_dict({key.removeprefix("ema."): value for key, value in saved.items() if key.startswith("ema.")})
     step = int(notes["step"])
@@ -79,6 +86,15 @@ def train(
     if validation is not None:
         summary.validation = validate(model, validation, settings, device)
     return summary
+
+
+def _child(rank: int, errors: Any, *work: Any) -> None:
+    """One process of several: errors that users shall read go to the parent as they are."""
+    try:
+        _run(rank, *work)
+    except DexgraspError as error:
+        errors.put(error)
+        raise
 
 
 def _run(

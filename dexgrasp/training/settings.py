@@ -30,6 +30,11 @@ class TrainerSettings:
     save_every: int = 500
 
     def __post_init__(self) -> None:
+        for name in ("steps", "batch", "shards", "calibrate", "log_every", "validate_every", "save_every"):
+            if getattr(self, name) < 1:
+                raise DexgraspError(f"trainer.{name} of at least 1", str(getattr(self, name)), f"set trainer.{name}")
+        if self.processes is not None and self.processes < 1:
+            raise DexgraspError("trainer.processes of at least 1", str(self.processes), "null takes all cores or GPUs")
         if self.batch % self.shards:
             raise DexgraspError(
                 "trainer.batch to be a multiple of trainer.shards", f"{self.batch} and {self.shards}", "change one"
