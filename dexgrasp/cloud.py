@@ -33,7 +33,7 @@ def prepare(points: Array, normals: Array | None, count: int, seed: int) -> Floa
         raise DexgraspError(
             "points in metres in the camera frame",
             f"a median distance of {distance:.4g} from the camera, which looks like millimetres",
-            "divide the points by 1000",
+            "divide the points by 1000 (`predict`: scale=0.001)",
         )
     directions = None if normals is None else _unit(xyz, _checked("normals", normals))
     if directions is None and len(xyz) > DENSE * count:

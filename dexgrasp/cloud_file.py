@@ -32,7 +32,12 @@ def read_cloud(path: Path, scale: float = 1.0) -> tuple[Array, Array | None]:
         raise DexgraspError(
             f"a readable {path.suffix} file", f"{path}: {type(error).__name__}: {error}", "write the file again"
         ) from error
-    rows = rows[np.isfinite(rows).all(axis=1)]
+    measured = np.isfinite(rows).all(axis=1)
+    if not measured.any():
+        raise DexgraspError(
+            f"points with numbers in {path}", f"{len(rows)}, all of them NaN or infinite", "measure again"
+        )
+    rows = rows[measured]
     return rows[:, :3] * scale, rows[:, 3:6] if rows.shape[1] >= 6 else None
 
 

@@ -12,7 +12,7 @@ from yaml import YAMLError
 
 from dexgrasp.config import conf_folder
 from dexgrasp.errors import DexgraspError
-from dexgrasp.registry import unknown
+from dexgrasp.registry import GROUPS, unknown
 
 
 def explain(error: Exception, command: str, overrides: list[str]) -> DexgraspError:
@@ -24,7 +24,11 @@ def explain(error: Exception, command: str, overrides: list[str]) -> DexgraspErr
         cause = cause.__cause__ or cause.__context__
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
-        return unknown(group or "config", name.removesuffix(".yaml"), sorted(error.options))
+        told = unknown(group or "config", name.removesuffix(".yaml"), sorted(error.options))
+        if group in GROUPS:
+            return told
+        hint, listed = told.remedy.split("`")[0], f"`python -m dexgrasp {command} --help` lists them"
+        return DexgraspError(f"a choice of {group}: {', '.join(sorted(error.options))}", told.found, hint + listed)
     if isinstance(error, OverrideParseException):
         return DexgraspError("overrides as key=value", repr(error.override), f"quote it for the shell: {error.message}")
     if isinstance(error, YAMLError):

@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dexgrasp.campaign import Campaign
 from dexgrasp.checkpoint import find_checkpoint, read_tensors
+from dexgrasp.dataset import stages
 from dexgrasp.dataset.pipeline import ensure
 from dexgrasp.errors import DexgraspError
 from dexgrasp.evaluation import Policy
@@ -38,6 +39,7 @@ class Settings:
         for key in ("top_k", "drawn"):
             if type(options[key]) is not int or options[key] < 0:
                 raise DexgraspError(f"evaluation.{key} to be a whole number", repr(options[key]), "set it so")
+        stages.Settings.read(options["dataset"])
         return cls(
             {str(key): value for key, value in options.items()},
             read(Policy, options["policy"], "evaluation.policy"),

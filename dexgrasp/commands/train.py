@@ -26,7 +26,7 @@ from dexgrasp.representation import Targets
 from dexgrasp.seeds import stream
 from dexgrasp.settings import read
 from dexgrasp.training import state
-from dexgrasp.training.loop import train
+from dexgrasp.training.loop import device_of, train
 from dexgrasp.training.settings import TrainerSettings
 
 CONFIG = "config.yaml"
@@ -47,6 +47,7 @@ def main(config: DictConfig) -> None:
 
 def _run(config: DictConfig, folder: Path, began: float) -> None:
     settings = read(TrainerSettings, config.trainer, "trainer")
+    device_of(settings)
     if config.evaluate:
         Settings.of(config)
     resumed = (folder / state.FILE).is_file()

@@ -54,7 +54,7 @@ def train(
     `folder` holds metrics.csv, TensorBoard events and the state for resuming; a state that is there is continued.
     Ctrl-C ends after the current step with everything saved.
     """
-    device = _device(settings.device)
+    device = device_of(settings)
     processes = _processes(settings, device)
     began = time.perf_counter()
     with _interrupt() as stop:
@@ -218,10 +218,14 @@ def _optimizer(model: GraspNet, settings: TrainerSettings) -> torch.optim.Optimi
     return kind(model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
 
 
-def _device(name: str) -> torch.device:
+def device_of(settings: TrainerSettings) -> torch.device:
+    """Return the device to train on; raises DexgraspError where there is none of that name."""
+    name, there = settings.device, torch.cuda.is_available()
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if name.startswith("cuda") and not torch.cuda.is_available():
+        return torch.device("cuda" if there else "cpu")
+    if name.partition(":")[0] not in ("cpu", "cuda"):
+        raise DexgraspError("trainer.device auto, cpu or cuda", repr(name), "choose one of them")
+    if name.startswith("cuda") and not there:
         raise DexgraspError("a CUDA device for trainer.device", "torch sees none", "use trainer.device=cpu")
     return torch.device(name)
 
