@@ -221,6 +221,7 @@ def _plain(config: Mapping[str, Any]) -> dict[str, Any]:
     try:
         container = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
     except Exception as cause:
-        raise DexgraspError("a config without open values", " ".join(str(cause).split()), "set them on the command line") from cause
+        found = " ".join(str(cause).split())
+        raise DexgraspError("a config without open values", found, "set them on the command line") from cause
     assert isinstance(container, dict)
     return {str(name): value for name, value in container.items()}

@@ -6,6 +6,7 @@ anew for the averaged weights at the end. The order of views depends on seed and
 """
 
 import copy
+import ctypes
 import math
 import os
 import signal
@@ -82,6 +83,8 @@ def train(
     step = int(notes["step"])
     summary = TrainingSummary(step, time.perf_counter() - began, processes, str(device))
     summary.losses, summary.interrupted = notes.get("losses", {}), step < settings.steps
+    if summary.interrupted:
+        return summary
     calibrate(model, samples, settings, seed, device)
     if validation is not None:
         summary.validation = validate(model, validation, settings, device)
@@ -90,6 +93,7 @@ def train(
 
 def _child(rank: int, errors: Any, *work: Any) -> None:
     """One process of several: errors that users shall read go to the parent as they are."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG: or we would train on when the parent is killed
     try:
         _run(rank, *work)
     except DexgraspError as error:
@@ -150,7 +154,7 @@ def _run(
             if not all(map(math.isfinite, losses.values())):
                 raise DexgraspError("finite losses", f"{losses} at step {step}", "lower trainer.learning_rate")
         if log is not None:
-            if step % settings.log_every == 0 or halted:
+            if step % settings.log_every == 0 or step == settings.steps:
                 log.write(step, "train", losses)
             if validation is not None and step % settings.validate_every == 0 and not halted:
                 log.write(step, "validation", _validate_average(model, average, validation, samples, settings, seed))
