@@ -97,9 +97,13 @@ class JointBins(nn.Module):
     ) -> Float[Tensor, "N S"]:
         """Return the angles (rad) of the likeliest bins and their residuals, always within the limits."""
         lower, width = self.lower[joint].to(residuals), self.width[joint].to(residuals)
-        index = self._masked(logits, joint).argmax(-1)
+        index = self.likeliest(logits, joint)
         residual = residuals.gather(-1, index.unsqueeze(-1)).squeeze(-1).clamp(-0.5, 0.5)
         return lower + (index + 0.5 + residual) * width
+
+    def likeliest(self, logits: Float[Tensor, "N S B"], joint: Int[Tensor, "N S"]) -> Int[Tensor, "N S"]:
+        """Return the likeliest bin of each slot."""
+        return self._masked(logits, joint).argmax(-1)
 
     def loss(
         self,

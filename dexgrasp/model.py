@@ -23,7 +23,7 @@ from dexgrasp.checkpoint import (
 from dexgrasp.cloud import prepare
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
-from dexgrasp.representation import Prediction, Representation
+from dexgrasp.representation import Prediction, Representation, Targets
 from dexgrasp.selection import Selection, select
 
 
@@ -53,15 +53,18 @@ class GraspNet(nn.Module):
     def hand(self) -> Hand:
         return self.representation.hand
 
-    def forward(self, cloud: Float[Tensor, "B N 6"], plan: Plan | None = None) -> tuple[Prediction, Int[Tensor, "B M"]]:
+    def forward(
+        self, cloud: Float[Tensor, "B N 6"], plan: Plan | None = None, truth: Targets | None = None
+    ) -> tuple[Prediction, Int[Tensor, "B M"]]:
         """Return the heads' outputs at all seeds of the batch, (B * M, ...), and the seeds' rows in each cloud.
 
-        `cloud` is position (m, camera frame) and unit normal. The backbone sees each cloud about its mean.
+        `cloud` is position (m, camera frame) and unit normal. The backbone sees each cloud about its mean. `truth`, in
+        training, is the targets of all seeds, see `Representation.forward`.
         """
         positions, normals = cloud.split(3, dim=-1)
         centred = torch.cat([positions - positions.mean(dim=1, keepdim=True), normals], dim=-1)
         features, seeds = self.backbone(centred, plan)
-        return self.representation(features.flatten(0, 1)), seeds
+        return self.representation(features.flatten(0, 1), truth), seeds
 
     @torch.no_grad()
     def propose(self, cloud: Float[Tensor, "N 6"], plan: Plan | None = None) -> Grasps:

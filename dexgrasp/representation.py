@@ -53,8 +53,12 @@ class Representation(nn.Module, ABC):
         """
 
     @abstractmethod
-    def forward(self, features: Float[Tensor, "N C"]) -> Prediction:
-        """Run the heads on point features."""
+    def forward(self, features: Float[Tensor, "N C"], truth: Targets | None = None) -> Prediction:
+        """Run the heads on point features.
+
+        In training, `truth` is what the points are labelled with: heads that build on the answers of earlier heads may
+        build on the true ones there (teacher forcing). Without it, they build on their own.
+        """
 
     @abstractmethod
     def loss(self, prediction: Prediction, targets: Targets) -> dict[str, Tensor]:

@@ -20,6 +20,9 @@ from dexgrasp.scene import View
 Check = Callable[[Grasps, Grasps], tuple[Bool[Tensor, "N"], Float[Tensor, "N"]]]
 """Told and original grasps -> which told ones are true, and their quality; `Truth.holds`, or one that asks more."""
 
+LIKE_DISTANCE, LIKE_ANGLE = 0.02, 0.3
+"""Scale on which two grasps are alike: bases apart, m; rotations and joints apart, rad."""
+
 
 @dataclass(frozen=True)
 class LabelSettings:
@@ -30,7 +33,9 @@ class LabelSettings:
     angle: float = math.radians(20)
     """Most that the contact's normal may differ from the point's estimated one, rad."""
     tries: int = 12
-    """Pairs of grasp and finger tried at each point, best quality first."""
+    """Pairs of grasp and finger tried at each point, best first."""
+    support: bool = True
+    """Best is the grasp with the most quality among grasps like it (`support`), else the one of best quality."""
     points: int | None = 2048
     """Only so many points of a view are labelled: the farthest-point samples, among which backbones choose their seeds
     in the same order; None: all."""
@@ -95,7 +100,8 @@ def label(
         chosen = farthest_points(view.points, settings.points).sort().values
     asked = View(view.points[chosen], view.normals[chosen], view.instance[chosen], view.world_T_camera)
     point, touched = near_pairs(asked, grasps, settings)
-    best_first = np.lexsort((touched, -grasps.quality.numpy()[touched // fingers], point))
+    worth = support(grasps) if settings.support else grasps.quality
+    best_first = np.lexsort((touched, -worth.numpy()[touched // fingers], point))
     contact = torch.from_numpy(touched[best_first])
     size = torch.from_numpy(np.bincount(point, minlength=len(asked)))
     start = size.cumsum(0) - size
@@ -126,6 +132,31 @@ def label(
         found.finger[row], found.grasp[row] = targets.finger.to(torch.int8), (pair // fingers).int()
         found.parameters[row], found.quality[row], found.true[row] = targets.parameters, quality, True
     return found
+
+
+def support(grasps: Grasps) -> Float[Tensor, "N"]:
+    """Return the quality of each grasp, summed over the grasps of its object that are like it (Gaussian weights).
+
+    Where many grasps are alike, a small error still gives a grasp; and neighbouring points are labelled with grasps of
+    one kind, not with whichever is best by a hair, so that the labels can be learnt.
+    """
+    worth = torch.zeros_like(grasps.quality)
+    for number in grasps.object.unique().tolist():
+        row = (grasps.object == number).nonzero().flatten()
+        own = grasps[row]
+        pose = own.pose.double()
+        # |R - S|^2 = 4 (1 - cos angle), about 2 angle^2; columns of one embedding, so that one distance says all.
+        like = torch.cat(
+            [
+                pose[:, :3, 3] / LIKE_DISTANCE,
+                pose[:, :3, :3].flatten(1) / (2**0.5 * LIKE_ANGLE),
+                own.joints.double() / LIKE_ANGLE,
+            ],
+            dim=1,
+        )
+        weight = torch.exp(-0.5 * torch.cdist(like, like, compute_mode="donot_use_mm_for_euclid_dist").square())
+        worth[row] = (weight @ own.quality.double()).to(worth)
+    return worth
 
 
 def near_pairs(view: View, grasps: Grasps, settings: LabelSettings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -35,7 +35,7 @@ def validate(model: GraspNet, samples: Samples, settings: TrainerSettings, devic
     starts = range(0, len(samples), size)
     for start in starts:
         batch = samples.batch(range(start, min(start + size, len(samples)))).to(device)
-        prediction, _ = model(batch.cloud, batch.plan)
+        prediction, _ = model(batch.cloud, batch.plan, batch.targets)
         for name, value in model.representation.loss(prediction, batch.targets).items():
             totals[name] = totals.get(name, 0.0) + float(value) / len(starts)
     return totals

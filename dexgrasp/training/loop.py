@@ -172,7 +172,7 @@ def _run(
 def _backward(model: GraspNet, batch: Batch, settings: TrainerSettings) -> dict[str, Tensor]:
     kind = batch.cloud.device.type
     with torch.autocast(kind, torch.bfloat16, enabled=settings.precision == "bfloat16"):
-        prediction, _ = model(batch.cloud, batch.plan)
+        prediction, _ = model(batch.cloud, batch.plan, batch.targets)
     prediction = {key: value.float() for key, value in prediction.items()}
     terms = model.representation.loss(prediction, batch.targets)
     (torch.stack(list(terms.values())).sum() / settings.shards).backward()

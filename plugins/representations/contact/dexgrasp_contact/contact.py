@@ -25,6 +25,9 @@ from dexgrasp.heads import (
 )
 from dexgrasp.representation import Prediction, Representation, Targets
 
+OWN, SHARED, SUPPORTING = range(3)
+"""What a joint slot of a finger is."""
+
 
 class Contact(Representation):
     """Parameters: x, y, then joint angles in slots: the touching finger's main joints, then its supporting ones.
@@ -41,6 +44,9 @@ class Contact(Representation):
         per_finger: tell projection and joints for each finger, so that the one that touches picks its own; else once,
             as in the paper.
         refine: predict supporting joints from features and the outputs of stages 1 and 2; else from features alone.
+        conditioned: each stage also sees what was decided before it, as one-hot classes: stage 2 the finger and the
+            bins of shared joints (which it tells first), stage 3 all bins of main joints. In training these are the
+            true ones. Where several grasps fit a point, the numbers then belong to one of them, not to their mean.
         hidden: widths of the hidden layers of each MLP.
         separate_heads: an MLP for each output, as in the paper; else the outputs of a stage share hidden layers.
         bins, shared_bins, joint_bins: see `JointBins`.
@@ -61,6 +67,7 @@ class Contact(Representation):
         *,
         per_finger: bool = False,
         refine: bool = True,
+        conditioned: bool = True,
         hidden: Sequence[int] = (128,),
         separate_heads: bool = False,
         bins: int = 7,
@@ -88,22 +95,31 @@ class Contact(Representation):
         # A joint slot is told in stage 2 if it is a main joint of any finger; slots that never move have no head.
         told = (self.joints.count[order] > 0).any(dim=0)
         mains = max(len(f.main) for f in hand.fingers)
+        kinds = _kinds(hand)
         self.main_slots = [k for k in range(mains) if told[k]]
+        self.first_slots = [k for k in self.main_slots if conditioned and bool((kinds[:, k] == SHARED).all())]
+        self.second_slots = [k for k in self.main_slots if k not in self.first_slots]
         self.supporting_slots = [k for k in range(mains, order.shape[1]) if told[k]]
         self.register_buffer("order", order, persistent=False)
-        self.register_buffer("kind", _kinds(hand), persistent=False)
+        self.register_buffer("kind", kinds, persistent=False)
         self.order: Tensor
         self.kind: Tensor
 
-        self.versions = len(hand.fingers) if per_finger else 1
+        self.versions, self.conditioned = len(hand.fingers) if per_finger else 1, conditioned
         each = 2 * self.joints.most * self.versions
+        known = len(hand.fingers) if conditioned else 0
         first = {"finger": len(hand.fingers) + 1}
-        second = {"xy": 2 * self.versions, "main": each * len(self.main_slots)}
+        shared = {"first": each * len(self.first_slots)}
+        second = {"xy": 2 * self.versions, "second": each * len(self.second_slots)}
         third = {"supporting": each * len(self.supporting_slots)}
-        told_before = sum(first.values()) + sum(second.values()) if refine else 0
         self.stage_1 = Heads(channels, first, hidden, separate=separate_heads)
-        self.stage_2 = Heads(channels, second, hidden, separate=separate_heads)
-        self.stage_3 = Heads(channels + told_before, third, hidden, separate=separate_heads)
+        self.stage_2_shared = Heads(channels + known, shared, hidden, separate=separate_heads)
+        known += self.joints.most * len(self.first_slots)
+        self.stage_2 = Heads(channels + known, second, hidden, separate=separate_heads)
+        if refine:
+            known += self.joints.most * len(self.second_slots) if conditioned else 0
+            known += sum((first | shared | second).values())
+        self.stage_3 = Heads(channels + (known if refine else 0), third, hidden, separate=separate_heads)
 
     def encode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grasps: Grasps) -> Targets:
         """Tell N grasps; `encodable` is False where z <= 0, or where no finger was chosen (then `finger` is 0).
@@ -136,17 +152,50 @@ class Contact(Representation):
         base = place(self.hand, finger, points, normals, outputs["xy"], joints)
         return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0])
 
-    def forward(self, features: Float[Tensor, "N C"]) -> Prediction:
+    def forward(self, features: Float[Tensor, "N C"], truth: Targets | None = None) -> Prediction:
         """Run the three stages: finger (N, F + 1) logits, xy (N, V, 2), main and supporting (N, V, slots, 2, bins).
 
         V is F with `per_finger`, else 1; bins are logits, then residuals.
         """
         told = self.stage_1(features)
-        told |= self.stage_2(features)
-        told |= self.stage_3(torch.cat([features, *told.values()], dim=-1) if self.refine else features)
-        for name, slots in (("main", self.main_slots), ("supporting", self.supporting_slots)):
-            told[name] = told[name].unflatten(-1, (self.versions, len(slots), 2, self.joints.most))
-        return told | {"xy": told["xy"].unflatten(-1, (self.versions, 2))}
+        finger = told["finger"][:, 1:].argmax(-1)
+        if truth is not None:
+            finger = torch.where(truth.finger > 0, truth.finger - 1, finger)
+        known = [F.one_hot(finger, len(self.hand.fingers)).to(features)] if self.conditioned else []
+        told |= self.stage_2_shared(torch.cat([features, *known], dim=-1))
+        first = self._unflat(told["first"], len(self.first_slots))
+        if self.conditioned:
+            known += self._decided(first, finger, self.first_slots, truth)
+        told |= self.stage_2(torch.cat([features, *known], dim=-1))
+        second = self._unflat(told["second"], len(self.second_slots))
+        if self.conditioned and self.refine:
+            known += self._decided(second, finger, self.second_slots, truth)
+        before = torch.cat([features, *known, *told.values()], dim=-1) if self.refine else features
+        told |= self.stage_3(before)
+        position = [(self.first_slots + self.second_slots).index(slot) for slot in self.main_slots]
+        return {
+            "finger": told["finger"],
+            "xy": told["xy"].unflatten(-1, (self.versions, 2)),
+            "main": torch.cat([first, second], dim=2)[:, :, position],
+            "supporting": self._unflat(told["supporting"], len(self.supporting_slots)),
+        }
+
+    def _unflat(self, outputs: Tensor, slots: int) -> Tensor:
+        return outputs.unflatten(-1, (self.versions, slots, 2, self.joints.most))
+
+    def _decided(
+        self, outputs: Tensor, finger: Int[Tensor, "N"], slots: list[int], truth: Targets | None
+    ) -> list[Float[Tensor, "N D"]]:
+        """Return the one-hot bins of some slots: the true ones where they are known, else the likeliest."""
+        if not slots:
+            return []
+        joint = self.order[finger][:, slots]
+        logits = of_finger({"": outputs}, finger)[""][..., 0, :]
+        chosen = self.joints.likeliest(logits, joint)
+        if truth is not None:
+            true, _ = self.joints.split(truth.parameters[:, 2:][:, slots], joint)
+            chosen = torch.where((truth.finger > 0).unsqueeze(-1), true, chosen)
+        return [F.one_hot(chosen, self.joints.most).to(outputs).flatten(1)]
 
     def loss(self, prediction: Prediction, targets: Targets) -> dict[str, Tensor]:
         """Return METHOD section 2's terms: finger, projection, main, shared, supporting.
@@ -185,7 +234,7 @@ class Contact(Representation):
 
 
 def _kinds(hand: Hand) -> Int[Tensor, "F J"]:
-    """Return what each slot of each finger is: 0 own main joint, 1 main joint shared by all fingers, 2 supporting."""
+    """Return what each slot of each finger is: its own main joint, a main joint of all fingers, or supporting."""
     shared = shared_joints(hand)
-    rows = [[1 if n in shared else 0 for n in f.main] + [2] * len(f.supporting) for f in hand.fingers]
+    rows = [[SHARED if n in shared else OWN for n in f.main] + [SUPPORTING] * len(f.supporting) for f in hand.fingers]
     return torch.tensor(rows)

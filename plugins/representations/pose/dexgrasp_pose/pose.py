@@ -108,10 +108,10 @@ class Pose(Representation):
         base = geometry.pose(rotation, points + self.scale * outputs["offset"])
         return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0])
 
-    def forward(self, features: Float[Tensor, "N C"]) -> Prediction:
+    def forward(self, features: Float[Tensor, "N C"], truth: Targets | None = None) -> Prediction:
         """Return finger (N, F + 1) logits, offset (N, V, 3), rotation (N, V, 6), joints (N, V, slots, 2, bins).
 
-        V is F with `per_finger`, else 1; bins are logits, then residuals.
+        V is F with `per_finger`, else 1; bins are logits, then residuals. No head builds on another's answer.
         """
         told = self.stage_2(features)
         shaped = {name: told[name].unflatten(-1, (self.versions, *shape)) for name, shape in self.shapes.items()}
