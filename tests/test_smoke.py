@@ -1,0 +1,104 @@
+"""From an empty folder to a trained, evaluated network with one command, as a user runs it; and what it refuses."""
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dexgrasp
+from dexgrasp.dataset.store import Store
+
+TINY = [
+    "experiment=smoke",
+    "dataset.objects.count=2",
+    "dataset.synthesis.target=100",
+    "dataset.synthesis.rounds=2",
+    "dataset.scenes.count=4",
+    "dataset.scenes.counts=[2]",
+    "dataset.views.framing.points=2048",
+    "trainer.steps=20",
+    "trainer.save_every=5",
+    "trainer.processes=1",
+    "evaluation.dataset.objects.count=2",
+    "evaluation.dataset.synthesis.target=50",
+    "evaluation.dataset.synthesis.rounds=1",
+    "evaluation.dataset.scenes.count=1",
+    "evaluation.workers=1",
+]
+
+
+def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+    command = [sys.executable, "-m", "dexgrasp", *arguments]
+    return subprocess.Popen(
+        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+
+
+def run(folder: Path, *arguments: str) -> tuple[int, str, str]:
+    process = start(folder, *arguments)
+    out, err = process.communicate(timeout=250)
+    return process.returncode, out, err
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run's folder."""
+    home = tmp_path_factory.mktemp("home")
+    status, out, err = run(home, "train", *TINY)
+    assert status == 0, out + err
+    folder = Path(out.splitlines()[-1])
+    assert folder.parent == home / "runs" / "train"
+    return folder
+
+
+def test_everything_from_nothing(made: Path) -> None:
+    results = json.loads((made / "results.json").read_text())
+    assert results["schema"] == "dexgrasp.training/1" and results["training"]["steps"] == 20
+    summary = results["evaluation"]["summary"]
+    assert summary["scenes"] == 1 and summary["attempts"] > 0 and sum(summary["reasons"].values()) > 0
+    page = (made / "evaluation" / "report.html").read_text()
+    assert "lift-v1" in page and page.count("data:image/png") == page.count("<img ")
+    steps = {int(row["step"]) for row in csv.DictReader((made / "metrics.csv").open())}
+    assert max(steps) == 20 and list(made.glob("tensorboard/events*"))
+
+
+def test_the_model_loads_and_predicts(made: Path, tmp_path: Path) -> None:
+    stores = [Store.open(folder) for folder in made.parents[2].glob("data/views-*")]
+    view = next(store for store in stores if len(store))[0].tensors
+    grasps = dexgrasp.load_model(made).predict(view["points"], view["normals"], top_k=5)
+    assert grasps.pose.isfinite().all() and (grasps.quality.diff() <= 0).all()
+    np.save(tmp_path / "view.npy", view["points"].numpy())
+    status, out, err = run(tmp_path, "predict", f"model={made}", "input=view.npy", "top_k=5", "selection.depth=null")
+    assert status == 0, out + err
+    folder = Path(out.splitlines()[-1])
+    told = json.loads((folder / "results.json").read_text())
+    with np.load(folder / "grasps.npz") as arrays:
+        assert len(arrays["pose"]) == len(told["grasps"]) <= 5
+    assert told["hand"] == "barrett" and told["joint_names"] == ["spread", "finger_1", "finger_2", "finger_3"]
+
+
+def test_a_killed_training_goes_on_to_the_same_weights(made: Path) -> None:
+    home, folder = made.parents[2], made.parent / "killed"
+    process = start(home, "train", *TINY, "evaluate=false", f"hydra.run.dir={folder}")
+    until = time.monotonic() + 120
+    while not (folder / "training.safetensors").exists() and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.02)
+    assert process.poll() is None, process.communicate()
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    assert not (folder / "model.safetensors").exists()
+    status, _, err = run(home, "train", f"resume={folder}")
+    assert status == 0, err
+    assert (folder / "model.safetensors").read_bytes() == (made / "model.safetensors").read_bytes()
+    assert (folder / "metrics.csv").read_text() == (made / "metrics.csv").read_text()
+    shutil.rmtree(folder)
