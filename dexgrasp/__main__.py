@@ -47,6 +47,9 @@ def main(argv: list[str] | None = None) -> int:
     except DexgraspError as error:
         print(f"dexgrasp {command}: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # `... | head`: nobody reads on
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except KeyboardInterrupt:
         print(f"\ndexgrasp {command}: interrupted", file=sys.stderr)
         return 130

@@ -34,8 +34,9 @@ def read_run(folder: Path, overrides: Sequence[str]) -> Run:
 
 
 def compare(runs: Sequence[Run], folder: Path) -> Path:
-    """Write comparison.md, .csv and .png of `runs` into `folder`; return the Markdown's path."""
-    keys = sorted({key for run in runs for key in run.label})
+    """Write comparison.md, .csv and .png of `runs` into `folder`, by what differs; return the Markdown's path."""
+    found = sorted({key for run in runs for key in run.label})
+    keys = [key for key in found if len({run.label.get(key) for run in runs}) > 1] or found
     lines = [[run.label.get(key, "") for key in keys] + _cells(run) for run in runs]
     head = [*keys, "SR %", "CR %", "epsilon", "attempts", "training s", "parameters"]
     table = [
@@ -91,7 +92,7 @@ def _plot(runs: Sequence[Run], keys: Sequence[str], path: Path) -> None:
                 axes.errorbar(entry["value"], -row, xerr=reach, fmt="o", color="#2b6ca3", capsize=3)
         labels = ["  ".join(f"{key}={run.label.get(key, '')}" for key in keys) for run in runs]
         axes.set_yticks([-row for row in range(len(runs))], labels if column == 0 else [""] * len(runs), fontsize=8)
-        axes.set_xlim(0, 1)
+        axes.set_xlim(-0.03, 1.03)
         axes.set_title(title, fontsize=10)
         axes.grid(axis="x", alpha=0.3)
     figure.savefig(path, dpi=120)

@@ -3,6 +3,7 @@
 import json
 import logging
 import statistics
+import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -24,7 +25,11 @@ def main(config: DictConfig) -> None:
 
     from dexgrasp.dataset import pipeline
 
-    dataset = pipeline.ensure(config.dataset, config.hand, config.repr if config.labels else None)
+    try:
+        dataset = pipeline.ensure(config.dataset, config.hand, config.repr if config.labels else None)
+    except KeyboardInterrupt:
+        print("what is done is kept; go on with the same command", file=sys.stderr)
+        raise
     rows = pipeline.summary(dataset)
     print(pipeline.table(rows))
     run = Path(HydraConfig.get().runtime.output_dir)
