@@ -16,12 +16,10 @@ from dexgrasp.grasps import Grasps
 from dexgrasp.representation import Representation, Targets
 from dexgrasp.sampling import farthest_points
 from dexgrasp.scene import View
+from dexgrasp.support import support
 
 Check = Callable[[Grasps, Grasps], tuple[Bool[Tensor, "N"], Float[Tensor, "N"]]]
 """Told and original grasps -> which told ones are true, and their quality; `Truth.holds`, or one that asks more."""
-
-LIKE_DISTANCE, LIKE_ANGLE = 0.02, 0.3
-"""Scale on which two grasps are alike: bases apart, m; rotations and joints apart, rad."""
 
 
 @dataclass(frozen=True)
@@ -132,31 +130,6 @@ def label(
         found.finger[row], found.grasp[row] = targets.finger.to(torch.int8), (pair // fingers).int()
         found.parameters[row], found.quality[row], found.true[row] = targets.parameters, quality, True
     return found
-
-
-def support(grasps: Grasps) -> Float[Tensor, "N"]:
-    """Return the quality of each grasp, summed over the grasps of its object that are like it (Gaussian weights).
-
-    Where many grasps are alike, a small error still gives a grasp; and neighbouring points are labelled with grasps of
-    one kind, not with whichever is best by a hair, so that the labels can be learnt.
-    """
-    worth = torch.zeros_like(grasps.quality)
-    for number in grasps.object.unique().tolist():
-        row = (grasps.object == number).nonzero().flatten()
-        own = grasps[row]
-        pose = own.pose.double()
-        # |R - S|^2 = 4 (1 - cos angle), about 2 angle^2; columns of one embedding, so that one distance says all.
-        like = torch.cat(
-            [
-                pose[:, :3, 3] / LIKE_DISTANCE,
-                pose[:, :3, :3].flatten(1) / (2**0.5 * LIKE_ANGLE),
-                own.joints.double() / LIKE_ANGLE,
-            ],
-            dim=1,
-        )
-        weight = torch.exp(-0.5 * torch.cdist(like, like, compute_mode="donot_use_mm_for_euclid_dist").square())
-        worth[row] = (weight @ own.quality.double()).to(worth)
-    return worth
 
 
 def near_pairs(view: View, grasps: Grasps, settings: LabelSettings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
