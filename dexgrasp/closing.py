@@ -17,6 +17,8 @@ from dexgrasp.triangle_tree import nearest
 
 TOUCH = 2e-5
 """A finger touches where the gap is at most this, m."""
+TIE = 1e-12
+"""Squared distances that differ by less are equal, m2."""
 FLAT = 1e-4
 """Balls within this of the surface at the moment of touch belong to the same contact, m."""
 NEAR = 0.5
@@ -270,12 +272,11 @@ def _settle(body: HandBody, field: Field, poses: np.ndarray, finger: int, stack:
             count += 1
     if count == 0:
         return False
+    x, y, z = found[:count, 1].mean(), found[:count, 2].mean(), found[:count, 3].mean()
     least, best = np.inf, 0
     for a in range(count):
-        square = 0.0
-        for k in range(1, 4):
-            square += (found[a, k] - found[:count, k].mean()) ** 2
-        if square < least:
+        square = (found[a, 1] - x) ** 2 + (found[a, 2] - y) ** 2 + (found[a, 3] - z) ** 2
+        if square < least - TIE:  # of equals, the first: rounding must not choose between mirrored contacts
             least, best = square, a
     hit[:] = found[best]
     return True

@@ -28,7 +28,7 @@ from dexgrasp.objects import load_objects
 from dexgrasp.plugins import build_hand, build_representation, load_class
 from dexgrasp.progress import track
 
-REVISION = 1
+REVISION = 2
 """Part of every hash; raised when code changes what the same settings give."""
 STAGES = ("objects", "grasps", "scenes", "views", "labels")
 log = logging.getLogger(__name__)
