@@ -1,0 +1,39 @@
+import torch
+
+from dexgrasp.grasps import Grasps
+from dexgrasp.support import support
+
+
+def grasps(places, objects, qualities) -> Grasps:
+    pose = torch.eye(4, dtype=torch.float64).repeat(len(places), 1, 1)
+    pose[:, 0, 3] = torch.tensor(places, dtype=torch.float64)
+    made = Grasps.build(pose, torch.zeros(len(places), 4).double(), 3, quality=torch.tensor(qualities).double())
+    return made.replace(object=torch.tensor(objects))
+
+
+def test_alone_it_is_the_quality():
+    far = grasps([0.0, 10.0], [0, 0], [0.3, 0.7])
+    torch.testing.assert_close(support(far), far.quality)
+
+
+def test_grasps_alike_back_each_other():
+    worth = support(grasps([0.0, 0.002, 0.004, 0.5], [0, 0, 0, 0], [0.1, 0.1, 0.1, 0.2]))
+    assert worth.argmax() == 1
+    assert worth[1] > worth[3] == 0.2
+
+
+def test_objects_do_not_back_each_other():
+    apart = support(grasps([0.0, 0.0], [0, 1], [0.1, 0.2]))
+    torch.testing.assert_close(apart, torch.tensor([0.1, 0.2]).double())
+    together = support(grasps([0.0, 0.0], [0, 0], [0.1, 0.2]))
+    torch.testing.assert_close(together, torch.tensor([0.3, 0.3]).double())
+
+
+def test_a_turned_or_opened_hand_is_another_grasp():
+    two = grasps([0.0, 0.0], [0, 0], [0.1, 0.1])
+    turned = two.pose.clone()
+    turned[1, :3, :3] = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    opened = two.joints.clone()
+    opened[1] = 1.0
+    assert support(two.replace(pose=turned)).max() < 0.11
+    assert support(two.replace(joints=opened)).max() < 0.11
