@@ -1,6 +1,7 @@
 """Shared test set-up."""
 
 import os
+import signal
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -24,6 +25,10 @@ from dexgrasp import geometry  # noqa: E402
 from dexgrasp.hand import Finger, Hand  # noqa: E402
 
 torch.set_num_threads(1)
+
+# A shell that starts the tests in the background has them ignore Ctrl-C, which what they start inherits: the tests of
+# interrupted runs would wait for ever.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
