@@ -1,6 +1,5 @@
 """An evaluation in full: every held-out scene cleared, beside the ceilings that its labels set."""
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -25,6 +24,7 @@ from dexgrasp.quality import epsilon, wrenches
 from dexgrasp.scene import View
 from dexgrasp.seeds import stream
 from dexgrasp.selection import Selection
+from dexgrasp.settings import read
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.statistics import bootstrap_ratio
@@ -72,8 +72,10 @@ class Campaign:
     def look(self, scene: int, objects: list[Object], poses: Float[Tensor, "O 4 4"], seed: int) -> View:
         """Return what the scene's fixed camera sees, with fresh noise."""
         config = self.dataset.config
-        camera = _settings(Viewpoints, config["views"]["viewpoints"]).draw(stream(self.seed, "viewpoint", scene))
-        framing = _settings(Framing, config["views"]["framing"])
+        camera = read(Viewpoints, config["views"]["viewpoints"], "dataset.views.viewpoints").draw(
+            stream(self.seed, "viewpoint", scene)
+        )
+        framing = read(Framing, config["views"]["framing"], "dataset.views.framing")
         meshes = [item.mesh for item in objects]
         return capture(meshes, poses, camera, Sensor.build(config["camera"]), framing, stream(seed, "sensor"))
 
@@ -138,7 +140,3 @@ def _ceiling_rates(verdicts: list[dict[str, list[bool]]], seed: int) -> dict[str
         wins, tries = [sum(v[kind]) for v in verdicts], [len(v[kind]) for v in verdicts]
         rates[kind] = rate(float(sum(wins)), sum(tries), bootstrap_ratio(wins, tries, seed))
     return rates
-
-
-def _settings(kind: Any, config: Mapping[str, Any]) -> Any:
-    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in config.items()})
