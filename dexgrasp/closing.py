@@ -10,27 +10,21 @@ from torch import Tensor
 
 from dexgrasp.batch import Batch
 from dexgrasp.collision import as_arrays, deepest
+from dexgrasp.distal_contact import distal_contact, is_tip
 from dexgrasp.distance import DistanceField, Field, estimate, lower_bound, seed_at
 from dexgrasp.hand import Hand
 from dexgrasp.hand_body import HandBody, carry, hand_body, place_link, place_links
+from dexgrasp.heap import push, replace
 from dexgrasp.triangle_tree import nearest
 
 TOUCH = 2e-5
 """A finger touches where the gap is at most this, m."""
-TIE = 1e-12
-"""Squared distances that differ by less are equal, m2."""
-FLAT = 1e-4
-"""Balls within this of the surface at the moment of touch belong to the same contact, m."""
 NEAR = 0.5
 """A bounding ball is split once the surface is nearer than this many times what splitting may gain."""
 CLOSE = 1e-3
 """Below this the grid's lower bound gives way to distances to triangles, m."""
-GRID = 4e-3
-"""Twice what the grid's lower bound may lack, m."""
 DOUBT = 5e-5
 """Allowance for triangles that a cell does not name, m; nearer than twice this the exact distance decides."""
-TIP_REACH = 1.25
-"""The rounded end reaches this many radii about the fingertip circle's centre, in the finger's side view."""
 
 CLOSED, PENETRATES, MISSES, OFF_TIP = range(4)
 """How a closing ended. The last three are told only by `close_fingers` with `strict`."""
@@ -142,9 +136,9 @@ def close_fingers(
                 link = body.ball_links[ball]
                 if other != finger or link == body.tip_links[finger]:
                     link = body.tip_links[other]
-                    if not _settle(body, field, poses, other, nodes, hit):
+                    if not distal_contact(body, field, poses, other, nodes, hit):
                         continue
-                    on_tip[i, other] = _is_tip(body, poses, other, hit)
+                    on_tip[i, other] = is_tip(body, poses, other, hit)
                 touches[i, other] = hit[1:7]
             if strict and not on_tip[i, finger]:
                 status[i] = MISSES if np.isnan(touches[i, finger, 0]) else OFF_TIP
@@ -185,7 +179,7 @@ def _advance(
         parent = body.parents[link]
         moving[link] = (parent >= 0 and moving[parent]) or (body.drives[link] >= 0 and rate[body.drives[link]] != 0)
         if moving[link] and body.roots[link] >= 0:
-            size = _push(keys, nodes, size, 0.0, body.roots[link])
+            size = push(keys, nodes, size, 0.0, body.roots[link])
     placed = 0.0
     while size:
         time, node = keys[0], nodes[0]
@@ -201,10 +195,10 @@ def _advance(
         left = body.children[node, 0]
         if left >= 0:
             if gap > NEAR * body.excess[node]:
-                size = _replace(keys, nodes, size, time + gap / body.speeds[finger, node], node)
+                size = replace(keys, nodes, size, time + gap / body.speeds[finger, node], node)
             else:
-                size = _replace(keys, nodes, size, time, left)
-                size = _push(keys, nodes, size, time, body.children[node, 1])
+                size = replace(keys, nodes, size, time, left)
+                size = push(keys, nodes, size, time, body.children[node, 1])
             continue
         if gap < CLOSE:
             about = estimate(field, x, y, z) - radius if gap + radius > 0 else 0.0
@@ -215,7 +209,7 @@ def _advance(
                 gap = hit[0] - radius
                 if gap <= TOUCH:
                     return node
-        size = _replace(keys, nodes, size, time + gap / body.speeds[finger, node], node)
+        size = replace(keys, nodes, size, time + gap / body.speeds[finger, node], node)
     _place(body, base, start, rate, end, moving, full, poses)
     return -1
 
@@ -237,113 +231,3 @@ def _place(
     for link in range(len(moving)):
         if moving[link]:
             place_link(body.motions, link, full, base, poses)
-
-
-@njit(cache=True)
-def _settle(body: HandBody, field: Field, poses: np.ndarray, finger: int, stack: np.ndarray, hit: np.ndarray) -> bool:
-    """Write to `hit` the one contact that stands for all of a distal link; return whether there is any.
-
-    The fingertip circle where it touches; else, of all balls that lie on the surface, the one whose contact is
-    nearest to their mean (k-means with one centre, and its medoid).
-    """
-    link = body.tip_links[finger]
-    x, y, z = carry(poses, link, body.tips, finger)
-    radius = body.tips[finger, 6]
-    if abs(lower_bound(field, x, y, z) - radius) < GRID:
-        nearest(field.tree, x, y, z, seed_at(field, x, y, z), hit)
-        if abs(hit[0] - radius) <= FLAT and _on_circle(body, poses, finger, hit):
-            return True
-    found = np.empty((256, 7))
-    count, top = 0, 1
-    stack[0] = body.roots[link]
-    while top and count < len(found):
-        top -= 1
-        node = stack[top]
-        x, y, z = carry(poses, link, body.balls, node)
-        radius = body.balls[node, 3]
-        if lower_bound(field, x, y, z) - radius > FLAT:
-            continue
-        if body.children[node, 0] >= 0:
-            stack[top], stack[top + 1] = body.children[node, 0], body.children[node, 1]
-            top += 2
-            continue
-        nearest(field.tree, x, y, z, seed_at(field, x, y, z), found[count])
-        if found[count, 0] - radius <= FLAT:
-            count += 1
-    if count == 0:
-        return False
-    x, y, z = found[:count, 1].mean(), found[:count, 2].mean(), found[:count, 3].mean()
-    least, best = np.inf, 0
-    for a in range(count):
-        square = (found[a, 1] - x) ** 2 + (found[a, 2] - y) ** 2 + (found[a, 3] - z) ** 2
-        if square < least - TIE:  # of equals, the first: rounding must not choose between mirrored contacts
-            least, best = square, a
-    hit[:] = found[best]
-    return True
-
-
-@njit(cache=True)
-def _on_circle(body: HandBody, poses: np.ndarray, finger: int, hit: np.ndarray) -> bool:
-    """Whether the fingertip circle's point opposite to the normal lies on the distal link's surface."""
-    link, tip = body.tip_links[finger], body.tips[finger]
-    at = np.empty(3)
-    for j in range(3):
-        along = 0.0
-        for k in range(3):
-            along += poses[link, k, j] * hit[4 + k]
-        at[j] = tip[j] - tip[6] * along
-    least = np.inf
-    for p in range(len(body.part_links)):
-        if body.part_links[p] == link:
-            outside = -np.inf
-            for s in range(body.parts[p], body.parts[p + 1]):
-                side = body.planes[s]
-                outside = max(outside, side[0] * at[0] + side[1] * at[1] + side[2] * at[2] - side[3])
-            least = min(least, outside)
-    return abs(least) <= 2 * FLAT
-
-
-@njit(cache=True)
-def _is_tip(body: HandBody, poses: np.ndarray, finger: int, hit: np.ndarray) -> bool:
-    """Whether the contact lies near the fingertip circle, seen along the closing axis."""
-    tip, pose = body.tips[finger], poses[body.tip_links[finger]]
-    x, y, z = carry(poses, body.tip_links[finger], body.tips, finger)
-    # Offset from the tip's centre and closing axis, both in the object frame; across = offset without its part along w.
-    across = np.empty(3)
-    w = np.empty(3)
-    along = 0.0
-    for k in range(3):
-        w[k] = pose[k, 0] * tip[3] + pose[k, 1] * tip[4] + pose[k, 2] * tip[5]
-    across[0], across[1], across[2] = hit[1] - x, hit[2] - y, hit[3] - z
-    for k in range(3):
-        along += across[k] * w[k]
-    square = 0.0
-    for k in range(3):
-        square += (across[k] - along * w[k]) ** 2
-    return square <= (TIP_REACH * tip[6]) ** 2
-
-
-@njit(cache=True)
-def _push(keys: np.ndarray, nodes: np.ndarray, size: int, key: float, node: int) -> int:
-    i = size
-    while i > 0 and keys[(i - 1) >> 1] > key:
-        keys[i], nodes[i] = keys[(i - 1) >> 1], nodes[(i - 1) >> 1]
-        i = (i - 1) >> 1
-    keys[i], nodes[i] = key, node
-    return size + 1
-
-
-@njit(cache=True)
-def _replace(keys: np.ndarray, nodes: np.ndarray, size: int, key: float, node: int) -> int:
-    """Exchange the head of the heap for a later entry."""
-    i = 0
-    while 2 * i + 1 < size:
-        child = 2 * i + 1
-        if child + 1 < size and keys[child + 1] < keys[child]:
-            child += 1
-        if keys[child] >= key:
-            break
-        keys[i], nodes[i] = keys[child], nodes[child]
-        i = child
-    keys[i], nodes[i] = key, node
-    return size

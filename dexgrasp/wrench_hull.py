@@ -8,6 +8,8 @@ both bounds meet, so most facets of the whole hull are never built.
 import numpy as np
 from numba import njit
 
+from dexgrasp.heap import pop, push
+
 DIM = 6
 ROUNDING = 1e-13
 """Distances below this (wrenches of order 1) count as on the plane when facets are sorted into visible and hidden."""
@@ -94,33 +96,6 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def _push(keys: np.ndarray, ids: np.ndarray, size: int, key: float, item: int) -> int:
-    i = size
-    while i > 0 and keys[(i - 1) >> 1] > key:
-        keys[i], ids[i] = keys[(i - 1) >> 1], ids[(i - 1) >> 1]
-        i = (i - 1) >> 1
-    keys[i], ids[i] = key, item
-    return size + 1
-
-
-@njit(cache=True)
-def _pop(keys: np.ndarray, ids: np.ndarray, size: int) -> int:
-    size -= 1
-    key, item = keys[size], ids[size]
-    i = 0
-    while 2 * i + 1 < size:
-        child = 2 * i + 1
-        if child + 1 < size and keys[child + 1] < keys[child]:
-            child += 1
-        if keys[child] >= key:
-            break
-        keys[i], ids[i] = keys[child], ids[child]
-        i = child
-    keys[i], ids[i] = key, item
-    return size
-
-
-@njit(cache=True)
 def _dot(a: np.ndarray, b: np.ndarray) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
 
@@ -171,16 +146,16 @@ def _epsilon(points: np.ndarray, threshold: float, decide: bool) -> float:
                 vertices[f, slot], neighbours[f, slot] = chosen[v], v
                 slot += 1
         planes[f, DIM] = _dot(planes[f], points[vertices[f, 0]])
-        heap = _push(keys, ids, heap, planes[f, DIM], f)
+        heap = push(keys, ids, heap, planes[f, DIM], f)
 
     upper = np.inf
     visible = np.empty(capacity, np.int64)
     for turn in range(1, 100_000):
         facet = ids[0]
-        heap = _pop(keys, ids, heap)
+        heap = pop(keys, ids, heap)
         while marks[facet, 0] < 0:
             facet = ids[0]
-            heap = _pop(keys, ids, heap)
+            heap = pop(keys, ids, heap)
         lower = planes[facet, DIM]
         if decide and lower >= threshold:
             return lower
@@ -255,7 +230,7 @@ def _epsilon(points: np.ndarray, threshold: float, decide: bool) -> float:
                 for j in range(DIM):
                     if neighbours[g, j] == f:
                         neighbours[g, j] = count
-                heap = _push(keys, ids, heap, planes[count, DIM], count)
+                heap = push(keys, ids, heap, planes[count, DIM], count)
                 count += 1
         # New facets meet where a turn about their common face, through visible facets only, leads from ridge to ridge.
         for s in range(seen):

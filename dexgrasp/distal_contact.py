@@ -1,0 +1,103 @@
+"""The one contact that stands for all of a distal link, once its finger has been stopped by an object."""
+
+import numpy as np
+from numba import njit
+
+from dexgrasp.distance import Field, lower_bound, seed_at
+from dexgrasp.hand_body import HandBody, carry
+from dexgrasp.triangle_tree import nearest
+
+FLAT = 1e-4
+"""Balls within this of the surface at the moment of touch belong to the same contact, m."""
+GRID = 4e-3
+"""Twice what the grid's lower bound may lack, m."""
+TIE = 1e-12
+"""Squared distances that differ by less are equal, m2."""
+TIP_REACH = 1.25
+"""The rounded end reaches this many radii about the fingertip circle's centre, in the finger's side view."""
+
+
+@njit(cache=True)
+def distal_contact(
+    body: HandBody, field: Field, poses: np.ndarray, finger: int, stack: np.ndarray, hit: np.ndarray
+) -> bool:
+    """Write to `hit` the one contact that stands for all of a distal link; return whether there is any.
+
+    The fingertip circle where it touches; else, of all balls that lie on the surface, the one whose contact is
+    nearest to their mean (k-means with one centre, and its medoid).
+    """
+    link = body.tip_links[finger]
+    x, y, z = carry(poses, link, body.tips, finger)
+    radius = body.tips[finger, 6]
+    if abs(lower_bound(field, x, y, z) - radius) < GRID:
+        nearest(field.tree, x, y, z, seed_at(field, x, y, z), hit)
+        if abs(hit[0] - radius) <= FLAT and _on_circle(body, poses, finger, hit):
+            return True
+    found = np.empty((256, 7))
+    count, top = 0, 1
+    stack[0] = body.roots[link]
+    while top and count < len(found):
+        top -= 1
+        node = stack[top]
+        x, y, z = carry(poses, link, body.balls, node)
+        radius = body.balls[node, 3]
+        if lower_bound(field, x, y, z) - radius > FLAT:
+            continue
+        if body.children[node, 0] >= 0:
+            stack[top], stack[top + 1] = body.children[node, 0], body.children[node, 1]
+            top += 2
+            continue
+        nearest(field.tree, x, y, z, seed_at(field, x, y, z), found[count])
+        if found[count, 0] - radius <= FLAT:
+            count += 1
+    if count == 0:
+        return False
+    x, y, z = found[:count, 1].mean(), found[:count, 2].mean(), found[:count, 3].mean()
+    least, best = np.inf, 0
+    for a in range(count):
+        square = (found[a, 1] - x) ** 2 + (found[a, 2] - y) ** 2 + (found[a, 3] - z) ** 2
+        if square < least - TIE:  # of equals, the first: rounding must not choose between mirrored contacts
+            least, best = square, a
+    hit[:] = found[best]
+    return True
+
+
+@njit(cache=True)
+def _on_circle(body: HandBody, poses: np.ndarray, finger: int, hit: np.ndarray) -> bool:
+    """Whether the fingertip circle's point opposite to the normal lies on the distal link's surface."""
+    link, tip = body.tip_links[finger], body.tips[finger]
+    at = np.empty(3)
+    for j in range(3):
+        along = 0.0
+        for k in range(3):
+            along += poses[link, k, j] * hit[4 + k]
+        at[j] = tip[j] - tip[6] * along
+    least = np.inf
+    for p in range(len(body.part_links)):
+        if body.part_links[p] == link:
+            outside = -np.inf
+            for s in range(body.parts[p], body.parts[p + 1]):
+                side = body.planes[s]
+                outside = max(outside, side[0] * at[0] + side[1] * at[1] + side[2] * at[2] - side[3])
+            least = min(least, outside)
+    return abs(least) <= 2 * FLAT
+
+
+@njit(cache=True)
+def is_tip(body: HandBody, poses: np.ndarray, finger: int, hit: np.ndarray) -> bool:
+    """Whether the contact lies near the fingertip circle, seen along the closing axis."""
+    tip, pose = body.tips[finger], poses[body.tip_links[finger]]
+    x, y, z = carry(poses, body.tip_links[finger], body.tips, finger)
+    # Offset from the tip's centre and closing axis, both in the object frame; across = offset without its part along w.
+    across = np.empty(3)
+    w = np.empty(3)
+    along = 0.0
+    for k in range(3):
+        w[k] = pose[k, 0] * tip[3] + pose[k, 1] * tip[4] + pose[k, 2] * tip[5]
+    across[0], across[1], across[2] = hit[1] - x, hit[2] - y, hit[3] - z
+    for k in range(3):
+        along += across[k] * w[k]
+    square = 0.0
+    for k in range(3):
+        square += (across[k] - along * w[k]) ** 2
+    return square <= (TIP_REACH * tip[6]) ** 2
