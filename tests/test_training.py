@@ -55,8 +55,9 @@ def same(a, b, **tolerance):
         torch.testing.assert_close(a[key], b[key], **(tolerance or {"rtol": 0, "atol": 0}), msg=key)
 
 
-def test_resumes_exactly(samples, tmp_path):
-    whole, summary = run(samples, tmp_path / "whole", processes=1)
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_resumes_exactly(samples, tmp_path, precision):
+    whole, summary = run(samples, tmp_path / "whole", processes=1, precision=precision)
     assert summary.steps == 6 and not summary.interrupted
     import dexgrasp.training.loop as loop
 
@@ -70,10 +71,22 @@ def test_resumes_exactly(samples, tmp_path):
 
     model, folder = network(), tmp_path / "cut"
     folder.mkdir()
-    loop._run(0, 1, 0, model, samples, None, SETTINGS, 3, folder, torch.device("cpu"), Stop())
+    settings = replace(SETTINGS, precision=precision)
+    loop._run(0, 1, 0, model, samples, None, settings, 3, folder, torch.device("cpu"), Stop())
     assert loop.read_tensors(folder / FILE)[1]["step"] == 3
-    resumed, _ = run(samples, folder, processes=1)
+    resumed, _ = run(samples, folder, processes=1, precision=precision)
     same(whole, resumed)
+
+
+def test_bfloat16_is_used_and_close(samples, tmp_path):
+    """Weights stay float32; what they come to differs, but the losses do not by more than rounding of 8 bits."""
+    (full, exact), (half, rounded) = (
+        run(samples, tmp_path / precision, processes=1, precision=precision, log_every=1)
+        for precision in ("float32", "bfloat16")
+    )
+    assert {value.dtype for value in half.values() if value.is_floating_point()} == {torch.float32}
+    assert any(not torch.equal(full[key], half[key]) for key in full)
+    assert sum(rounded.validation.values()) == pytest.approx(sum(exact.validation.values()), rel=0.05)
 
 
 def test_same_result_whatever_the_number_of_processes(samples, tmp_path):
