@@ -42,3 +42,20 @@ def rotation_angle(a: Float[Tensor, "*#b 3 3"], b: Float[Tensor, "*#b 3 3"]) -> 
     """Return the geodesic angle between rotations (rad), accurate near 0 and near pi."""
     chord = torch.linalg.matrix_norm(a - b) / (2 * 2**0.5)
     return 2 * torch.asin(chord.clamp(max=1.0))
+
+
+def look_at(eye: Float[Tensor, "3"], target: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
+    """Return world_T_camera (float64) of a camera without roll: image x is horizontal, image y points down.
+
+    Straight above the target, where that leaves the turn open, image x is the world's x.
+    """
+    forward = torch.nn.functional.normalize(target.double() - eye.double(), dim=0)
+    up = forward.new_tensor([0.0, 0.0, 1.0])
+    right = torch.linalg.cross(forward, up)
+    if right.norm() < 1e-6:
+        right = forward.new_tensor([1.0, 0.0, 0.0])
+    right = torch.nn.functional.normalize(right, dim=0)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
+    pose[:3, 3] = eye
+    return pose

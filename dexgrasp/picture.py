@@ -67,17 +67,3 @@ def picture(
         brightness = 0.4 + 0.2 * np.abs(facing) + 0.4 * direct * ~shaded
         image[seen] = np.stack(colours)[faces[triangles]] * brightness[:, None]
     return (np.clip(image, 0, 1) * 255).round().astype(np.uint8).reshape(height, width, 3)
-
-
-def look_at(eye: Sequence[float], target: Sequence[float], up: Sequence[float] = (0, 0, 1)) -> Array:
-    """Return world_T_camera (4, 4) of a camera at `eye` that looks at `target`, m."""
-    forward = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, np.asarray(up, dtype=np.float64))
-    if np.linalg.norm(right) < 1e-6:
-        right = np.cross(forward, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    pose[:3, 3] = eye
-    return pose

@@ -12,10 +12,11 @@ from jaxtyping import UInt8
 
 from dexgrasp.checkpoint import replace_file
 from dexgrasp.evaluation import Episode
+from dexgrasp.geometry import look_at
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.objects import ObjectSet
-from dexgrasp.picture import look_at, picture
+from dexgrasp.picture import picture
 
 PALETTE = ((0.86, 0.45, 0.35), (0.40, 0.62, 0.80), (0.55, 0.74, 0.44), (0.85, 0.70, 0.35), (0.62, 0.52, 0.76))
 HAND = (0.35, 0.37, 0.42)
@@ -132,10 +133,10 @@ def draw_grasp(
     ]
     links, base = hand.link_poses(grasp.joints.double()), grasp.pose[0].double()
     bodies += [(mesh, (base @ links[link][0]).numpy(), HAND) for link, mesh in hand.visuals.items()]
-    at = base[:3, 3].numpy() * 0.5
-    away = strip["view"].world_T_camera[:3, 3].double().numpy() - at
-    away[2] = min(away[2], 0.7 * float(np.linalg.norm(away[:2])))
-    return picture(bodies, look_at((at + 0.62 * away / np.linalg.norm(away)).tolist(), at.tolist()), size)
+    at = base[:3, 3] * 0.5
+    away = strip["view"].world_T_camera[:3, 3].double() - at
+    away[2] = away[2].clamp(max=0.7 * float(away[:2].norm()))
+    return picture(bodies, look_at(at + 0.62 * away / away.norm(), at).numpy(), size)
 
 
 def _mosaic(path: Path, tiles: Sequence[tuple[str, UInt8[np.ndarray, "H W 3"]]]) -> Path:

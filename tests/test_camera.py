@@ -9,9 +9,10 @@ import torch
 import trimesh
 import yaml
 
-from dexgrasp.dataset.camera import NOTHING, TABLE, Camera, RayScene, Viewpoints, look_at
+from dexgrasp.dataset.camera import NOTHING, TABLE, Camera, RayScene, Viewpoints
 from dexgrasp.dataset.sensor import Framing, Noise, Sensor, capture, dominant_plane, downsample, observe
 from dexgrasp.errors import DexgraspError
+from dexgrasp.geometry import look_at
 from dexgrasp.seeds import stream
 
 CAMERA = Camera(width=320, height=240, fx=307.5, fy=307.5, cx=159.5, cy=119.5, near=0.2, far=3.0)
@@ -27,19 +28,6 @@ def at(x: float, y: float, z: float) -> torch.Tensor:
 def box_and_ball() -> tuple[list[trimesh.Trimesh], torch.Tensor]:
     meshes = [trimesh.creation.box([0.06, 0.08, 0.1]), trimesh.creation.icosphere(5, 0.04)]
     return meshes, torch.stack([at(0.06, 0, 0.05), at(-0.06, 0, 0.04)])
-
-
-def test_look_at_axes() -> None:
-    pose = look_at(torch.tensor([0.3, 0.4, 0.5]), torch.tensor([0.0, 0.0, 0.1]))
-    rotation = pose[:3, :3]
-    torch.testing.assert_close(rotation.T @ rotation, torch.eye(3, dtype=torch.float64))
-    assert torch.linalg.det(rotation) > 0
-    assert abs(rotation[2, 0]) < 1e-12 and rotation[2, 1] < 0, "image x is horizontal, image y points down"
-    target = torch.linalg.inv(pose) @ torch.tensor([0, 0, 0.1, 1], dtype=torch.float64)
-    torch.testing.assert_close(target[:2], torch.zeros(2, dtype=torch.float64), atol=1e-7, rtol=0)
-    assert target[2] > 0
-    down = look_at(torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3))
-    assert torch.linalg.det(down[:3, :3]) == pytest.approx(1)
 
 
 def test_depth_is_z_and_geometry_is_exact() -> None:

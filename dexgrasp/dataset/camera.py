@@ -12,6 +12,8 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dexgrasp.geometry import look_at
+
 TABLE, NOTHING = -1, -2
 """Instances of a rendering that are no objects."""
 
@@ -90,23 +92,6 @@ class RayScene:
             instance=np.where(seen, instance, NOTHING).astype(np.int32).reshape(shape),
             normals=np.where(seen[:, None], normals, 0).reshape(*shape, 3),
         )
-
-
-def look_at(eye: Float[Tensor, "3"], target: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
-    """Return world_T_camera (float64) of a camera without roll: image x is horizontal, image y points down.
-
-    Straight above the target, where that leaves the turn open, image x is the world's x.
-    """
-    forward = torch.nn.functional.normalize(target.double() - eye.double(), dim=0)
-    up = forward.new_tensor([0.0, 0.0, 1.0])
-    right = torch.linalg.cross(forward, up)
-    if right.norm() < 1e-6:
-        right = forward.new_tensor([1.0, 0.0, 0.0])
-    right = torch.nn.functional.normalize(right, dim=0)
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
-    pose[:3, 3] = eye
-    return pose
 
 
 @dataclass(frozen=True)
