@@ -95,7 +95,7 @@ class Folders(Callback):
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         folder = Path(config.hydra.run.dir).absolute()
         Folders.made = tuple(itertools.takewhile(lambda path: not path.exists(), [folder, *folder.parents]))
-        if "${now:" in str(config.hydra.run._get_node("dir")._value()) and not config.get("resume"):
+        if _timed(config.hydra.run) and not config.get("resume"):
             folder = _claim(folder)
             Folders.made = (folder, *Folders.made[1:])
             with open_dict(config):
@@ -112,22 +112,50 @@ class Folders(Callback):
             for handler in [each for each in root.handlers if isinstance(each, logging.FileHandler)]:
                 root.removeHandler(handler)
                 handler.close()
-            shutil.rmtree(Folders.made[0])
-            for folder in Folders.made[1:]:
-                if any(folder.iterdir()):
-                    break
-                folder.rmdir()
+            Folders.remove()
+
+    @staticmethod
+    def remove() -> None:
+        """Take away the folder that was made, and those above it that were made for it and are empty now."""
+        shutil.rmtree(Folders.made[0])
+        for folder in Folders.made[1:]:
+            if any(folder.iterdir()):
+                break
+            folder.rmdir()
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        Folders.multirun = Path(config.hydra.sweep.dir).absolute()
+        folder = Path(config.hydra.sweep.dir).absolute()
+        Folders.made = tuple(itertools.takewhile(lambda path: not path.exists(), [folder, *folder.parents]))
+        if _timed(config.hydra.sweep):
+            folder = _claim(folder)
+            Folders.made = (folder, *Folders.made[1:])
+            with open_dict(config):
+                config.hydra.sweep.dir = str(folder)
+                config.hydra.overrides.hydra.append(f"hydra.sweep.dir={_quoted(str(folder))}")  # jobs compose anew
+        Folders.multirun = folder
 
 
 def compare(command: str) -> None:
-    """After a multirun, call the command's `compare(folder)` where it has one."""
-    if Folders.multirun is not None and Folders.multirun.is_dir():
-        hook = getattr(import_module(f"dexgrasp.commands.{command}"), "compare", None)
-        if hook is not None:
-            hook(Folders.multirun)
+    """After a multirun, call the command's `compare(folder)` where it has one; one that began no run leaves nothing."""
+    folder = Folders.multirun
+    if folder is None or not folder.is_dir():
+        return
+    if Folders.made[:1] == (folder,) and {path.name for path in folder.iterdir()} <= {"multirun.yaml"}:
+        Folders.remove()
+        return
+    hook = getattr(import_module(f"dexgrasp.commands.{command}"), "compare", None)
+    if hook is not None:
+        hook(folder)
+
+
+def _timed(where: DictConfig) -> bool:
+    """Whether a folder is named by the time, so that it shall be new; one that the user names may be there already."""
+    return "${now:" in str(where._get_node("dir")._value())  # type: ignore[union-attr]
+
+
+def _quoted(text: str) -> str:
+    """Return a value for an override, whatever characters it has."""
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def _claim(folder: Path) -> Path:

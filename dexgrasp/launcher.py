@@ -115,6 +115,7 @@ class Job:
         self.label, self.number, self.folder, self.overrides = label, number, folder, overrides
         self.file, self.answer = folder / ".job.pickle", folder / ".result.pickle"
         self.began = 0.0
+        self.process: subprocess.Popen[bytes] | None = None
 
     def start(self, workers: int) -> None:
         """Start the process; threads are divided among the jobs that run together."""
@@ -133,7 +134,7 @@ class Job:
 
     def ended(self) -> bool:
         """Whether the process is over; takes in its result and says so once."""
-        if self.process.poll() is None:
+        if self.process is None or self.process.poll() is None:
             return False
         self.returned = self._result()
         verdict = "ends" if self.returned.status is JobStatus.COMPLETED else "FAILED"
@@ -147,6 +148,7 @@ class Job:
             self.answer.unlink()
             return returned
         except Exception:
+            assert self.process is not None
             status = f"exit status {self.process.returncode}, see {self.folder / self.OUTPUT}"
             returned = JobReturn(overrides=self.overrides, status=JobStatus.FAILED)
             returned.return_value = RuntimeError(status)
@@ -154,6 +156,8 @@ class Job:
 
     def stop(self) -> None:
         """Interrupt the job, and end it where it does not obey."""
+        if self.process is None:  # Ctrl-C while it was being started
+            return
         self.process.send_signal(signal.SIGINT)
         try:
             self.process.wait(PATIENCE)

@@ -211,6 +211,30 @@ def test_a_glob_sweeps_every_installed_hand_and_the_runs_are_compared(command):
     assert {path.name for path in folder.iterdir() if path.is_dir()} == {str(i) for i in range(len(SEEN))}
 
 
+def test_multiruns_of_one_second_have_folders_of_their_own(command):
+    compared = []
+    command.module.compare = compared.append
+    where = r"hydra.sweep.dir='it\'s ${now:%Y}_multirun'"  # one time for both
+    for _ in range(2):
+        assert command("-m", "seed=1,2", where, "hydra/launcher=basic")[0] == 0
+    first, second = sorted((command.folder / "elsewhere").iterdir())
+    assert (first.name[:5], second.name) == ("it's ", f"{first.name}_2") and compared == [first, second]
+    for folder in (first, second):
+        assert {path.name for path in folder.iterdir()} == {"0", "1", "multirun.yaml"}
+        for job in ("0", "1"):
+            assert OmegaConf.load(folder / job / ".hydra/hydra.yaml").hydra.runtime.output_dir == str(folder / job)
+
+
+@pytest.mark.parametrize("wrong", ["part=smal,large", "sed=1,2"])
+@pytest.mark.parametrize("launcher", ["basic", "local", "submitit_local"])
+def test_a_multirun_that_begins_no_run_leaves_nothing(command, wrong, launcher):
+    if launcher == "submitit_local":
+        pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    status, out, err = command("-m", wrong, f"hydra/launcher={launcher}")
+    assert status == 2 and "did you mean" in err and "Traceback" not in out + err
+    assert not list((command.folder / "elsewhere").iterdir())
+
+
 def test_a_pipelines_tool_takes_ordinary_arguments(command):
     command.module.tool = SEEN.append
     assert command("inspect", "some/path=odd")[0] == 0
@@ -273,6 +297,20 @@ def test_jobs_run_side_by_side_and_one_may_fail_alone(multirun):
     assert not list(multirun.runs.rglob("*.pickle"))
 
 
+@pytest.mark.parametrize("launcher", ["local", "submitit_local"])
+def test_launchers_send_jobs_to_the_folder_of_their_multirun(multirun, launcher):
+    if launcher == "submitit_local":
+        pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    words = ("seed=1,2", "hydra.sweep.dir=runs/probe/${now:%Y}", f"hydra/launcher={launcher}")
+    both = [multirun(*words) for _ in range(2)]  # at the same time
+    for process in both:
+        _, err = process.communicate(timeout=120)
+        assert process.returncode == 0, err
+    found = sorted(path.relative_to(multirun.runs).parts for path in multirun.runs.glob("*/[01]/.hydra/config.yaml"))
+    year = found[0][0]
+    assert [part[:2] for part in found] == [(year, "0"), (year, "1"), (f"{year}_2", "0"), (f"{year}_2", "1")]
+
+
 def test_ctrl_c_reaches_the_jobs_once(multirun):
     process = multirun("seed=9,9,1", "hydra.launcher.workers=2")
     until = time.monotonic() + 60
@@ -282,13 +320,6 @@ def test_ctrl_c_reaches_the_jobs_once(multirun):
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130 and "interrupted" in err and "Traceback" not in err
     assert [text.count("saved") for text in outputs(multirun.runs).values()] == [1, 1], "and the third never began"
-
-
-def test_submitit_runs_the_same_jobs(multirun):
-    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
-    _, err = (process := multirun("seed=1,2", "hydra/launcher=submitit_local")).communicate(timeout=120)
-    assert process.returncode == 0, err
-    assert len(list(multirun.runs.glob("*/[01]/.hydra/config.yaml"))) == 2
 
 
 def test_threads_are_divided_among_the_jobs(tmp_path):
