@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from omegaconf import OmegaConf
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -110,6 +111,44 @@ def load_state(module: torch.nn.Module, tensors: Mapping[str, Tensor], path: Pat
             "use the version of dexgrasp and of the plugins that wrote it",
         )
     module.load_state_dict(dict(tensors))
+
+
+def load_start(module: torch.nn.Module, hand: Hand, config: Mapping[str, Any], path: Path) -> None:
+    """Load the weights that a new training of `module`, built from `config`, starts from.
+
+    Raises DexgraspError where they are of another hand, representation or backbone, or of other sizes.
+    """
+    tensors, notes = read_tensors(path)
+    if notes.get("kind") != "model":
+        raise DexgraspError(
+            "the weights of a finished training", f"{path}, which holds something else", f"give its {FILE}"
+        )
+    check_hand(hand, notes["hand"], path)
+    trained, now = notes["config"], {key: _plain(config[key]) for key in ("repr", "backbone")}
+    other = [f"{kind}={trained[kind]['name']}" for kind in now if trained[kind]["name"] != now[kind]["name"]]
+    shapes, given = ({key: value.shape for key, value in each.items()} for each in (module.state_dict(), tensors))
+    if other or shapes != given:
+        differing = other or [
+            f"{kind}.{key}={_word(value)}"
+            for kind, settings in now.items()
+            for key, value in trained[kind].items()
+            if value != settings.get(key)
+        ]
+        raise DexgraspError(
+            f"weights for repr={now['repr']['name']} backbone={now['backbone']['name']} as they are set",
+            f"{path} of a network with {' '.join(differing) or 'other layers'}",
+            "set the same here, start from other weights, or train without init_from",
+        )
+    module.load_state_dict(tensors)
+
+
+def _plain(config: Any) -> Any:
+    return OmegaConf.to_container(config, resolve=False) if OmegaConf.is_config(config) else config
+
+
+def _word(value: Any) -> str:
+    """Return a value as it is typed on the command line."""
+    return json.dumps(value, separators=(",", ":")).replace('"', "")
 
 
 def kinematics(hand: Hand) -> dict[str, Any]:

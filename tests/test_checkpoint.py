@@ -5,10 +5,19 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from safetensors.torch import save_file
 
 from dexgrasp import checkpoint
-from dexgrasp.checkpoint import check_hand, find_checkpoint, kinematics, load_state, read_tensors, write_tensors
+from dexgrasp.checkpoint import (
+    check_hand,
+    find_checkpoint,
+    kinematics,
+    load_start,
+    load_state,
+    read_tensors,
+    write_tensors,
+)
 from dexgrasp.errors import DexgraspError
 
 
@@ -95,3 +104,27 @@ def test_another_hand_is_refused(tmp_path):
             check_hand(hand, {**trained, **changed}, tmp_path)
     renamed = SimpleNamespace(**{**vars(hand), "name": "copy"}, fingertips=hand.fingertips)
     check_hand(renamed, trained, tmp_path)  # a name alone makes no other hand
+
+
+def test_a_training_starts_only_from_weights_of_its_own_network(tmp_path):
+    from dexgrasp import load_hand
+
+    config = {"repr": {"name": "contact", "bins": 7, "alpha": 1.0}, "backbone": {"name": "pointnet", "local": [8, 8]}}
+    hand, path, layer = load_hand("barrett"), tmp_path / checkpoint.FILE, torch.nn.Linear(2, 3)
+    notes = {"kind": "model", "hand": kinematics(hand), "config": config}
+    write_tensors(path, {"weight": torch.ones(3, 2), "bias": torch.ones(3)}, notes)
+    composed = OmegaConf.create({**config, "repr": {**config["repr"], "alpha": 2.0, "new": None}})
+    load_start(layer, hand, composed, path)  # weights of losses may differ, options of a later version may come
+    assert layer.weight.min() == 1
+    for kind in ("repr", "backbone"):
+        with pytest.raises(DexgraspError, match=f"of a network with {kind}={config[kind]['name']}\n"):
+            load_start(layer, hand, {**config, kind: {"name": "other"}}, path)
+    for kind, change, told in (
+        ("repr", {"bins": 8}, r"repr\.bins=7"),
+        ("backbone", {"local": [16, 16]}, r"backbone\.local=\[8,8\]"),
+    ):
+        with pytest.raises(DexgraspError, match=f"with {told}\n"):
+            load_start(torch.nn.Linear(2, 4), hand, {**config, kind: {**config[kind], **change}}, path)
+    write_tensors(path, {}, {"step": 3, "losses": {}})  # the state for resuming
+    with pytest.raises(DexgraspError, match=r"(?s)weights of a finished training.*model\.safetensors"):
+        load_start(layer, hand, config, path)
