@@ -6,6 +6,7 @@ the weights as a readable ``.json``, which is never read back.
 
 import difflib
 import json
+import logging
 import os
 import tempfile
 from collections.abc import Mapping
@@ -21,6 +22,7 @@ from torch import Tensor
 from dexgrasp.errors import DexgraspError, room
 from dexgrasp.hand import Hand
 
+log = logging.getLogger(__name__)
 FORMAT = 1
 WEIGHTS = Path(__file__).parent / "weights"
 """Shipped checkpoints, ``<name>.safetensors``."""
@@ -126,19 +128,21 @@ def load_start(module: torch.nn.Module, hand: Hand, config: Mapping[str, Any], p
     check_hand(hand, notes["hand"], path)
     trained, now = notes["config"], {key: _plain(config[key]) for key in ("repr", "backbone")}
     other = [f"{kind}={trained[kind]['name']}" for kind in now if trained[kind]["name"] != now[kind]["name"]]
+    differing = other or [
+        f"{kind}.{key}={_word(value)}"
+        for kind, settings in now.items()
+        for key, value in trained[kind].items()
+        if value != settings.get(key)
+    ]
     shapes, given = ({key: value.shape for key, value in each.items()} for each in (module.state_dict(), tensors))
     if other or shapes != given:
-        differing = other or [
-            f"{kind}.{key}={_word(value)}"
-            for kind, settings in now.items()
-            for key, value in trained[kind].items()
-            if value != settings.get(key)
-        ]
         raise DexgraspError(
             f"weights for repr={now['repr']['name']} backbone={now['backbone']['name']} as they are set",
             f"{path} of a network with {' '.join(differing) or 'other layers'}",
             "set the same here, start from other weights, or train without init_from",
         )
+    if differing:
+        log.warning("%s was trained with %s; going on from it with what is set here", path, " ".join(differing))
     module.load_state_dict(tensors)
 
 

@@ -106,7 +106,7 @@ def test_another_hand_is_refused(tmp_path):
     check_hand(renamed, trained, tmp_path)  # a name alone makes no other hand
 
 
-def test_a_training_starts_only_from_weights_of_its_own_network(tmp_path):
+def test_a_training_starts_only_from_weights_of_its_own_network(tmp_path, caplog):
     from dexgrasp import load_hand
 
     config = {"repr": {"name": "contact", "bins": 7, "alpha": 1.0}, "backbone": {"name": "pointnet", "local": [8, 8]}}
@@ -115,7 +115,7 @@ def test_a_training_starts_only_from_weights_of_its_own_network(tmp_path):
     write_tensors(path, {"weight": torch.ones(3, 2), "bias": torch.ones(3)}, notes)
     composed = OmegaConf.create({**config, "repr": {**config["repr"], "alpha": 2.0, "new": None}})
     load_start(layer, hand, composed, path)  # weights of losses may differ, options of a later version may come
-    assert layer.weight.min() == 1
+    assert layer.weight.min() == 1 and "trained with repr.alpha=1.0;" in caplog.text
     for kind in ("repr", "backbone"):
         with pytest.raises(DexgraspError, match=f"of a network with {kind}={config[kind]['name']}\n"):
             load_start(layer, hand, {**config, kind: {"name": "other"}}, path)
