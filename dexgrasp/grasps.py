@@ -69,21 +69,28 @@ class Grasps(Batch):
 
 
 class Reason(IntEnum):
-    """Why an attempt ended as it did, in the order in which they are tested."""
+    """How an attempt ended; by how much is moved, raised or inside, the protocol's `verdict` says.
+
+    The first that applies is told: NO_GRASP, COLLIDED, MULTIPLE, SUCCESS, SLIPPED, TOPPLED, NOT_LIFTED, MISSED.
+    """
 
     SUCCESS = 0
+    """At the end the object, and only it, is lifted and held (or is lifted, where the protocol is not `exclusive`)."""
     NO_GRASP = 1
-    """The network, or the collision filter behind it, offered no grasp."""
+    """Nothing was tried: no grasp was offered, or the protocol skips it for its tilt."""
     COLLIDED = 2
-    """The open hand touched table or objects on its way to the grasp."""
+    """On its way the open hand was inside something, moved an object or was stopped short; it did not close."""
     MISSED = 3
-    """After closing, the hand held nothing."""
+    """The closed hand touched no object and moved none away: it closed beside it, or slid off. Where a target was
+    given: it holds another object."""
     TOPPLED = 4
-    """Closing pushed the object away or over, it was never lifted."""
+    """An object was pushed away or over; none left the table."""
     SLIPPED = 5
-    """The object left the table and fell, or slid out while held."""
+    """An object left the table, but at the end it is not held high enough: dropped, thrown, or slid down."""
     MULTIPLE = 6
-    """More than the one object was lifted."""
+    """An object is lifted and held, and another was raised with it."""
+    NOT_LIFTED = 7
+    """The closed hand touched an object, yet none left the table or was moved away: no grip, or too weak a one."""
 
 
 @dataclass(frozen=True)

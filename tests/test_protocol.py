@@ -1,6 +1,7 @@
 """Protocols: METHOD's numbers, and errors for YAML that is not one."""
 
 import copy
+import dataclasses
 
 import pytest
 import yaml
@@ -31,6 +32,19 @@ def test_cmgnet_code_is_method_section_5() -> None:
     assert protocol.verdict.stop_at == 1
 
 
+@pytest.mark.parametrize("name", ["lift-v1", "cmgnet-code"])
+def test_every_number_stands_in_the_yaml_and_old_configs_mean_the_same(name: str) -> None:
+    config = yaml.safe_load((conf_folder() / "protocol" / f"{name}.yaml").read_text())
+    protocol = load_protocol(config)
+    for group in ("physics", "motion", "verdict"):
+        fields = dataclasses.fields(getattr(protocol, group))
+        assert list(config[group]) == [field.name for field in fields]
+        for field in fields:
+            if field.default is not dataclasses.MISSING and field.name != "alongside":
+                assert config[group].pop(field.name) == field.default
+    assert load_protocol(config) == protocol
+
+
 def test_wrong_keys_and_values_are_told(config: dict) -> None:
     def fails(change, words: str) -> None:
         wrong = copy.deepcopy(config)
@@ -45,6 +59,8 @@ def test_wrong_keys_and_values_are_told(config: dict) -> None:
     fails(lambda c: c["physics"].update(friction=-1.0), "physics.friction")
     fails(lambda c: c["physics"].update(gravity=float("nan")), "physics.gravity")
     fails(lambda c: c["verdict"].update(exclusive=1), "verdict.exclusive")
+    fails(lambda c: c["verdict"].update(look=0.0), "verdict.look: a number above 0")
+    fails(lambda c: c["verdict"].update(pushed="far"), "verdict.pushed: a number of at least 0")
     fails(lambda c: c.update(motion=3), "motion")
 
 

@@ -67,21 +67,61 @@ def test_lifts_simple_things_and_misses_air(name, hand, simulator) -> None:
     torch.testing.assert_close(outcomes.final[1, 0, :3, 3], at((0, 0, height))[0, :3, 3], atol=1e-3, rtol=0)
 
 
-def test_slippery_things_and_heavy_things_stay(hand, simulator) -> None:
-    for protocol in (
-        changed(physics={"friction": 0.02, "torsional_friction": 0.0}),
-        changed(physics={"mass_min": 30.0, "mass_max": 30.0}),
-    ):
-        outcomes = simulator.execute([BOX], at((0, 0, 0.03)), hand, from_above(0.195), protocol)
-        assert not outcomes.success.any()
-        assert outcomes.reason[0] in (Reason.SLIPPED, Reason.MISSED, Reason.TOPPLED)
+@dataclasses.dataclass
+class Case:
+    """One attempt from above; things are placed by their centres."""
+
+    reason: Reason
+    height: float = 0.195
+    things: tuple[tuple[float, float, float], ...] = ((0.06, 0.06, 0.06),)
+    places: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.03),)
+    joints: tuple[float, ...] = (0.0, 1.0, 1.0, 1.0)
+    groups: dict = dataclasses.field(default_factory=dict)
+
+    def told(self, simulator, hand, **verdict: float) -> Reason:
+        groups = {**self.groups, "verdict": verdict}
+        things, grasps = (
+            [convex(trimesh.creation.box(t)) for t in self.things],
+            from_above(self.height, joints=self.joints),
+        )
+        outcomes = simulator.execute(things, at(*self.places), hand, grasps, changed(**groups))
+        assert bool(outcomes.success) is (int(outcomes.reason) == Reason.SUCCESS)
+        return Reason(int(outcomes.reason))
 
 
-def test_two_at_once_is_no_success(hand, simulator) -> None:
-    halves = [convex(trimesh.creation.box((0.03, 0.06, 0.06))) for _ in range(2)]
-    poses = at((-0.0151, 0, 0.03), (0.0151, 0, 0.03))
-    outcomes = simulator.execute(halves, poses, hand, from_above(0.195), PROTOCOL)
-    assert not outcomes.success.any()
+ONE_SIDE = (np.pi, 0.8, 0.8, 0.8)
+"""Spread so that all fingers close from the same side: they hold nothing, they push."""
+CASES = {
+    "the fingers start inside it": Case(Reason.COLLIDED, 0.03),
+    "the palm pushes it": Case(Reason.COLLIDED, 0.13, ((0.02, 0.02, 0.12),), ((0, 0, 0.06),)),
+    "the table stops the hand": Case(Reason.COLLIDED, 0.05, places=((0.3, 0, 0.03),)),
+    "nothing is there": Case(Reason.MISSED, 0.45),
+    "it stands beside": Case(Reason.MISSED, places=((0.2, 0, 0.03),)),
+    "the table stops the fingers": Case(Reason.MISSED, 0.18),
+    "pushed over": Case(Reason.TOPPLED, 0.2, ((0.06, 0.06, 0.1),), ((0, -0.02, 0.05),), ONE_SIDE),
+    "rolled over an edge, higher for a while": Case(
+        Reason.TOPPLED, 0.19, ((0.06, 0.06, 0.07),), ((0, -0.02, 0.035),), ONE_SIDE, {"physics": {"friction": 2.0}}
+    ),
+    "pushed along": Case(Reason.TOPPLED, groups={"physics": {"friction": 0.02}}),
+    "thrown when the lift stops dead": Case(Reason.SLIPPED, groups={"motion": {"lift_time": 0.03}}),
+    "two abreast": Case(
+        Reason.MULTIPLE, things=((0.03, 0.06, 0.06),) * 2, places=((-0.0151, 0, 0.03), (0.0151, 0, 0.03))
+    ),
+    "too heavy": Case(Reason.NOT_LIFTED, groups={"physics": {"mass_min": 30.0, "mass_max": 30.0}}),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_failure_has_its_reason(name, hand, simulator) -> None:
+    assert CASES[name].told(simulator, hand) is CASES[name].reason
+
+
+def test_limits_of_the_verdict_are_the_protocols(hand, simulator) -> None:
+    """Each limit, moved past what happened, changes what is told of the same motion."""
+    assert CASES["pushed along"].told(simulator, hand, pushed=1.0) in (Reason.NOT_LIFTED, Reason.MISSED)
+    assert CASES["two abreast"].told(simulator, hand, alongside=0.35) is Reason.SUCCESS
+    assert CASES["thrown when the lift stops dead"].told(simulator, hand, left=1.0) is Reason.TOPPLED
+    assert CASES["the palm pushes it"].told(simulator, hand, displaced=1.0, blocked=1.0) is not Reason.COLLIDED
 
 
 def test_another_target_is_no_success(hand, simulator) -> None:

@@ -12,17 +12,6 @@ from dexgrasp.simulation.world import World
 
 Array = NDArray[np.float64]
 
-CHECK = 10
-"""Time steps between two looks at the state."""
-LOST = 5
-"""Looks without any touch after which an object counts as lost."""
-TOUCHED_AGAINST_TABLE = 0.01
-"""Rise from which an object has left the table, m."""
-MOVED = 0.02
-"""Displacement from which a hand that holds nothing has pushed an object away, m."""
-STALLED = 0.02
-"""Joint speed below which a closing joint stands still, rad/s or m/s."""
-
 
 @dataclass(frozen=True)
 class Result:
@@ -56,8 +45,10 @@ class Attempt:
         world.reset(poses)
         world.place_hand(plan.start_pose, plan.start_joints)
         self.initial = world.centres().copy()
+        self.check = max(self._steps(protocol.verdict.look), 1)
         self.first = -1
-        self.highest = np.zeros(len(self.initial))
+        self.gripped = False
+        self.left = np.zeros(len(self.initial), dtype=bool)
 
     def run(self) -> Result:
         """Return the verdict; stops as soon as it is known."""
@@ -66,22 +57,23 @@ class Attempt:
         if not self._approach():
             return self._result(Reason.COLLIDED)
         self._close()
-        if not self.world.touched().any():
-            return self._result(self._nothing_held())
+        self.gripped = bool(self.world.touched().any())
+        if not self.gripped:
+            return self._result(self._failure())
         lost = self._lift()
-        return self._result(self._nothing_held() if lost else self._verdict())
+        return self._result(self._failure() if lost else self._verdict())
 
     def _approach(self) -> bool:
         motion, verdict = self.protocol.motion, self.protocol.verdict
         steps = self._steps(motion.approach_time)
-        for step in range(steps + self._steps(0.05)):
+        for step in range(steps + self._steps(motion.arrival_time)):
             share = min((step + 1) / steps, 1.0)
             self.data.mocap_pos[0] = self.plan.start_pose[:3, 3] + share * (
                 self.plan.pose[:3, 3] - self.plan.start_pose[:3, 3]
             )
             # The fingers keep still: they close only when the palm has arrived.
             mujoco.mj_step(self.model, self.data)
-            if step % CHECK == 0:
+            if step % self.check == 0:
                 self._look()
                 if self._displaced().max(initial=0.0) > verdict.displaced:
                     return False
@@ -113,11 +105,11 @@ class Attempt:
             goal = np.clip(goal, lower, upper)
             self.data.ctrl[:] = goal
             mujoco.mj_step(self.model, self.data)
-            if step % CHECK == 0:
+            if step % self.check == 0:
                 self._look()
                 joints = self.data.qpos[self.world.driver_qpos]
-                still = np.abs(self.data.qvel[self.world.driver_qvel]) < STALLED
-                pushing = direction * (goal - joints) > 0.9 * lead
+                still = np.abs(self.data.qvel[self.world.driver_qvel]) < motion.stalled_speed
+                pushing = direction * (goal - joints) > motion.stalled_effort * lead
                 ended = np.where(direction > 0, goal >= upper, goal <= lower)
                 driven = (step + 1 - steps) * speed > beyond
                 if step >= steps and (driven or (still & (pushing | ended))[closing].all()):
@@ -129,31 +121,34 @@ class Attempt:
             squeeze = direction * (step + 1) / steps * (motion.grip_effort - motion.closing_effort) * error
             self.data.ctrl[:] = np.clip(goal + squeeze, lower, upper)
             mujoco.mj_step(self.model, self.data)
-            if step % CHECK == 0:
+            if step % self.check == 0:
                 self._look()
 
     def _lift(self) -> bool:
         """Return True when the hand lost everything on the way."""
         motion = self.protocol.motion
         steps, total = self._steps(motion.lift_time), self._steps(motion.lift_time + motion.hold)
+        looks = max(round(self.protocol.verdict.lost / self.protocol.verdict.look), 1)
         untouched = 0
         for step in range(total):
             share = min((step + 1) / steps, 1.0)
             height = motion.lift * (0.5 - 0.5 * np.cos(np.pi * share))
             self.data.mocap_pos[0, 2] = self.plan.pose[2, 3] + height
             mujoco.mj_step(self.model, self.data)
-            if step % CHECK == 0:
+            if step % self.check == 0:
                 untouched = 0 if self._look() else untouched + 1
-                if untouched >= LOST:
+                if untouched >= looks:
                     return True
         return False
 
     def _look(self) -> bool:
-        """Note what is touched and how high it is; return whether the hand touches anything."""
+        """Note what is touched and what has left the table; return whether the hand touches anything."""
         touched = self.world.touched()
         if self.first < 0 and touched.any():
             self.first = int(np.argmax(touched))
-        self.highest = np.maximum(self.highest, self._rise())
+        risen = self._rise() > self.protocol.verdict.left
+        if risen.any():
+            self.left |= risen & ~self.world.on_table()
         return bool(touched.any())
 
     def _rise(self) -> Array:
@@ -162,20 +157,23 @@ class Attempt:
     def _displaced(self) -> Array:
         return np.linalg.norm(self.world.centres() - self.initial, axis=1) * self.world.present
 
-    def _nothing_held(self) -> Reason:
-        if self.highest.max(initial=0.0) > TOUCHED_AGAINST_TABLE:
+    def _failure(self) -> Reason:
+        """Why nothing is held that counts."""
+        if self.left.any():
             return Reason.SLIPPED
-        return Reason.TOPPLED if self._displaced().max(initial=0.0) > MOVED else Reason.MISSED
+        if self._displaced().max(initial=0.0) > self.protocol.verdict.pushed:
+            return Reason.TOPPLED
+        return Reason.NOT_LIFTED if self.gripped else Reason.MISSED
 
     def _verdict(self) -> Reason:
         verdict = self.protocol.verdict
         lifted = (self._rise() >= verdict.rise) & self.world.present
         if not verdict.exclusive:
-            return Reason.SUCCESS if lifted.any() else self._nothing_held()
+            return Reason.SUCCESS if lifted.any() else self._failure()
         held = lifted & self.world.touched()
         if not held.any():
-            return self._nothing_held()
-        if (self._rise() >= 0.5 * verdict.rise).sum() > 1:
+            return self._failure()
+        if (self._rise() >= verdict.alongside).sum() > 1:
             return Reason.MULTIPLE
         if self.target >= 0 and not held[self.target]:
             return Reason.MISSED
@@ -184,7 +182,7 @@ class Attempt:
     def _result(self, reason: Reason) -> Result:
         rise = self._rise()
         highest = int(np.argmax(rise)) if len(rise) else -1
-        number = highest if highest >= 0 and rise[highest] > TOUCHED_AGAINST_TABLE else self.first
+        number = highest if highest >= 0 and rise[highest] > self.protocol.verdict.left else self.first
         return Result(reason, number, float(rise[number]) if number >= 0 else 0.0, self.world.poses())
 
     def _steps(self, time: float) -> int:

@@ -21,8 +21,8 @@ from dexgrasp.simulation.world import World
 
 KEPT_WORLDS = 4
 """Compiled worlds that are kept: a closed-loop round comes back to its scene after every attempt."""
-REST_LOOKS = 10
-"""Successive looks at which all objects must be slow to be at rest."""
+REST_STEPS = 10
+"""Time steps between two looks at objects that come to rest."""
 
 
 class MujocoSimulator(Simulator):
@@ -41,12 +41,12 @@ class MujocoSimulator(Simulator):
         physics = self.settling.physics
         world = self.world(objects, None, physics)
         world.reset(poses.detach().double().cpu().numpy())
-        quiet = 0
+        quiet, looks = 0, max(round(physics.rest_time / (REST_STEPS * physics.timestep)), 1)
         for step in range(round(physics.settle_time / physics.timestep)):
             mujoco.mj_step(world.model, world.data)
-            if step % 10 == 9:
+            if step % REST_STEPS == REST_STEPS - 1:
                 quiet = quiet + 1 if (world.speeds() * world.present < physics.rest_speed).all() else 0
-                if quiet >= REST_LOOKS:
+                if quiet >= looks:
                     break
         final = world.poses()
         final[np.linalg.norm(final[:, :2, 3], axis=1) > physics.table_radius] = np.nan

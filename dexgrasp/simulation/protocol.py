@@ -12,6 +12,18 @@ from dexgrasp.errors import DexgraspError
 
 T = TypeVar("T")
 
+POSITIVE = (
+    "timestep",
+    "contact_time",
+    "wrist_time",
+    "servo_error",
+    "approach_time",
+    "closing_speed",
+    "lift_time",
+    "look",
+)
+"""Keys that are divided by, or that mean nothing at 0; the others may be 0."""
+
 
 @dataclass(frozen=True)
 class Physics:
@@ -48,6 +60,8 @@ class Physics:
     """Below this an object rests (m/s; rad/s times 10)."""
     settle_time: float
     """Longest time to come to rest, s."""
+    rest_time: float = 0.2
+    """Objects that were all slow for this long are at rest, s."""
 
 
 @dataclass(frozen=True)
@@ -78,11 +92,17 @@ class Motion:
     """s."""
     hold: float
     """s."""
+    arrival_time: float = 0.05
+    """Time for the base to come to rest after the approach, s."""
+    stalled_speed: float = 0.02
+    """A closing joint slower than this stands still, rad/s or m/s."""
+    stalled_effort: float = 0.9
+    """It has stalled once it also pushes with more than this share of `closing_effort`."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What counts as what."""
+    """What counts as what; see `Reason`."""
 
     rise: float
     """An object that rose by this much at the end was lifted, m."""
@@ -98,6 +118,16 @@ class Verdict:
     """Grasps that approach more than this off straight down are skipped, degrees."""
     stop_at: int
     """A clutter round ends when this many objects are left."""
+    look: float = 0.02
+    """Time between two looks at the state, s."""
+    lost: float = 0.1
+    """A lifting hand that has touched nothing for this long has lost everything, s."""
+    left: float = 0.01
+    """An object that rose by more than this and does not touch the table has left it, m."""
+    pushed: float = 0.02
+    """An object that never left the table but moved by more than this was pushed away or over, m."""
+    alongside: float = 0.125
+    """With `exclusive`: another object that rose by this much at the end was lifted as well, m."""
 
 
 @dataclass(frozen=True)
@@ -117,8 +147,10 @@ class Protocol:
 def load_protocol(config: str | Mapping[str, Any]) -> Protocol:
     """Return a protocol from its name in `conf/protocol` or from a composed config.
 
+    A key that has a default may be missing, as in configs that were saved before there was such a key.
+
     Raises:
-        DexgraspError: an unknown protocol, an unknown or missing key, or a value of the wrong type.
+        DexgraspError: an unknown protocol, an unknown or missing key, or a value of the wrong type or out of range.
     """
     if isinstance(config, str):
         from dexgrasp.config import conf_folder
@@ -134,15 +166,18 @@ def load_protocol(config: str | Mapping[str, Any]) -> Protocol:
 
 
 def _build(kind: type[T], config: Mapping[str, Any], where: str) -> T:
-    expected = {field.name: field.type for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    if not isinstance(config, Mapping) or set(config) != set(expected):
-        found = set(config) if isinstance(config, Mapping) else set()
+    fields = dataclasses.fields(kind)  # type: ignore[arg-type]
+    found = set(config) if isinstance(config, Mapping) else set()
+    unknown = found - {field.name for field in fields}
+    missing = {field.name for field in fields if field.default is dataclasses.MISSING} - found
+    if unknown or missing or not isinstance(config, Mapping):
         raise DexgraspError(
-            f"{where}: the keys {', '.join(expected)}",
-            f"unknown {sorted(found - set(expected))}, missing {sorted(set(expected) - found)}",
+            f"{where}: the keys {', '.join(field.name for field in fields)}",
+            f"unknown {sorted(unknown)}, missing {sorted(missing)}",
             "correct the YAML in conf/protocol; a change of rules needs a new version",
         )
-    return kind(**{key: _value(type_, config[key], f"{where}.{key}") for key, type_ in expected.items()})
+    given = (field for field in fields if field.name in found)
+    return kind(**{field.name: _value(field.type, config[field.name], f"{where}.{field.name}") for field in given})
 
 
 def _value(kind: Any, value: Any, where: str) -> Any:
@@ -152,9 +187,11 @@ def _value(kind: Any, value: Any, where: str) -> Any:
     if optional and value is None:
         return None
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if (kind is float or optional) and number and math.isfinite(value) and value >= 0:
+    positive = where.rpartition(".")[2] in POSITIVE
+    if (kind is float or optional) and number and math.isfinite(value) and (value > 0 if positive else value >= 0):
         return float(value)
     if kind in (int, bool, str) and type(value) is kind:
         return value
-    name = "a number of at least 0" if kind is float or optional else f"a value of type {kind.__name__}"
+    least = "above 0" if positive else "of at least 0"
+    name = f"a number {least}" if kind is float or optional else f"a value of type {kind.__name__}"
     raise DexgraspError(f"{where}: {name}", repr(value), "correct the YAML in conf/protocol")

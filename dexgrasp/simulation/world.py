@@ -110,18 +110,24 @@ class World:
 
     def touched(self) -> NDArray[np.bool_]:
         """Return (O,) which objects the hand touches now."""
-        result = np.zeros(len(self._bodies), dtype=bool)
-        pairs = self._pairs()[self.data.contact.dist <= 0]
-        hands = (pairs == HAND).any(axis=1)
-        others = pairs[hands].max(axis=1)
-        result[others[others >= 0]] = True
-        return result
+        return self._touching(HAND)
+
+    def on_table(self) -> NDArray[np.bool_]:
+        """Return (O,) which objects touch the table now."""
+        return self._touching(TABLE)
 
     def intrusion(self) -> float:
         """Return how deep the hand is inside table or objects now, m."""
         hands = (self._pairs() == HAND).any(axis=1)
         depths = -self.data.contact.dist[hands]
         return float(max(depths.max(initial=0.0), 0.0))
+
+    def _touching(self, owner: int) -> NDArray[np.bool_]:
+        result = np.zeros(len(self._bodies), dtype=bool)
+        pairs = self._pairs()[self.data.contact.dist <= 0]
+        others = pairs[(pairs == owner).any(axis=1)].max(axis=1)
+        result[others[others >= 0]] = True
+        return result
 
     def _pairs(self) -> NDArray[np.int64]:
         return self._owner[self.data.contact.geom]
