@@ -54,12 +54,20 @@ def upright(solid: Manifold) -> Manifold:
     return solid.rotate([90, 0, 0])
 
 
-def knuckle_head() -> tuple[Manifold, Manifold]:
-    """Return head of a knuckle (frame of the spread joint), and what is cut from it: slot and cable bores."""
+def knuckle_head(slim: bool = False) -> tuple[Manifold, Manifold]:
+    """Return head of a knuckle (frame of the spread joint), and what is cut from it: slot and cable bores.
+
+    The `slim` head is that of the BH8-282's fixed knuckle, which has no bores.
+    """
     joint = np.array([-50.0, 33.9])
     foot = [(-27, 24.8), (-27, 0), (-50, 0.3), (-63.3, 7.2), (-65, 10)]
-    head = upright(prism(hull(disc(joint, 15.0), foot), -12.3, 12.3, 1.3))
-    room = hull(disc(joint, 14.0), [(-70, 22), (-70, 60), (-30.5, 60), (-30.5, 30.8)])
+    radius, floor = 15.0, [(-70.0, 22.0), (-30.5, 30.8)]
+    if slim:
+        foot[2:], radius, floor = [(-44.7, 0), (-60.3, 8.7), (-62.5, 11.5)], 13.0, [(-70.0, 16.0), (-35.0, 16.0)]
+    head = upright(prism(hull(disc(joint, radius), foot), -12.3, 12.3, 1.3))
+    room = hull(disc(joint, 14.0), [floor[0], (-70, 60), (floor[1][0], 60), floor[1]])
+    if slim:
+        return head, upright(prism(room, -SLOT[1], -SLOT[0]))
     cable = Manifold.cylinder(25, 3.2, 3.2, 24).rotate([0, -90, 0]).translate([-41, -0.8, 4])
     for y in (-6.3, 4.7):
         cable += Manifold.cylinder(27, 1.2, 1.2, 12).rotate([0, -90, 0]).translate([-39, y, 16.6])
@@ -87,12 +95,12 @@ def palm_plate(bottom: float, top: float) -> Manifold:
 def base_parts(model: str) -> list[Manifold]:
     """Return can, web, plate and finger 3's knuckle of the base, all convex."""
     deck, face = DECK[model], FACE[model]
-    rim, under, back = {"280": (6.0, 66.3, -42.0), "282": (8.0, 50.0, -35.0)}[model]
+    rim, under, back, front = {"280": (6.0, 66.3, -42.0, 30.0), "282": (8.0, 50.0, -35.0, 35.0)}[model]
     can = loft([(disc(HUB, r, step=6)[:-1], z) for r, z in [(44.4, rim), (44.5, deck - 1.3), (43.2, deck)]])
     flange = loft([(disc(HUB, 42.8, step=6)[:-1], z) for z in (0.0, rim)])
     top = face - 8.7
     shoulder = [(back, top - 3), (back + 2, top - 0.4), (-32, top + 1), (-23, face - 2)]
-    web = hull([(back, deck - 1), (30, deck - 1), (30, under + 1)], shoulder)
+    web = hull([(back, deck - 1), (front, deck - 1), (front, under + 1)], shoulder)
     stand = prism(web, -12.3, 12.3).rotate([90, 0, 90])  # drawn in (x, y), meant in (y, z)
     head, _ = placed_knuckle(model)
     return [can, flange, stand, palm_plate(under, face), head]
@@ -100,12 +108,13 @@ def base_parts(model: str) -> list[Manifold]:
 
 def placed_knuckle(model: str) -> tuple[Manifold, Manifold]:
     """Return finger 3's knuckle head and slot in the base frame."""
-    head, room = (part.rotate([0, 0, -90]).translate([0, 0, DECK[model]]) for part in knuckle_head())
+    parts = knuckle_head(slim=model == "282")
+    head, room = (part.rotate([0, 0, -90]).translate([0, 0, DECK[model]]) for part in parts)
     return head, room
 
 
 def base(model: str) -> Manifold:
-    """Return the palm: parts joined; bores of the spread joints, finger 3's slot, sockets and screw holes cut."""
+    """Return the palm: parts joined; finger 3's slot and screw holes cut, and the 280's bores, socket and plug."""
     solid = Manifold.batch_boolean(base_parts(model), OpType.Add)
     bores = [Manifold.cylinder(6, 9.3, 9.3, 40).translate([x, 0, DECK[model] - 5]) for x in (-25, 25)]
     _, room = placed_knuckle(model)
@@ -113,7 +122,8 @@ def base(model: str) -> Manifold:
     plug = Manifold.cube([11, 5, 12], True)
     screws = [Manifold.cylinder(9, 1.3, 1.3, 12).rotate([0, 0, turn]).translate(
         [30 * np.cos(np.radians(turn)), 30 * np.sin(np.radians(turn)), 0]) for turn in (0, 90, 180, 270)]  # fmt: skip
-    return Manifold.batch_boolean([solid, *bores, *screws, room, socket, plug], OpType.Subtract)
+    cut = [*bores, *screws, room, socket, plug] if model == "280" else [*screws, room]
+    return Manifold.batch_boolean([solid, *cut], OpType.Subtract)
 
 
 def knuckle() -> Manifold:
