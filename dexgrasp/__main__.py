@@ -101,6 +101,10 @@ def pipeline(command: str, arguments: list[str]) -> int:
         if full:
             raise
         raise overrides.explain(error, command, words) from error
+    except ValueError as error:
+        if full or not str(error).startswith("Only one of --run"):
+            raise
+        raise DexgraspError("one of -m, --cfg and --info", " ".join(arguments), "try --cfg without -m") from error
     finally:
         if not isinstance(sys.exception(), KeyboardInterrupt):
             config.compare(command)

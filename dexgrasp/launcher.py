@@ -12,6 +12,7 @@ import sys
 import time
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,7 +68,8 @@ class LocalLauncher(Launcher):
         """Run all jobs, each whatever becomes of the others; returns in the jobs' order."""
         setup_globals()
         configure_log(self.config.hydra.hydra_logging, self.config.hydra.verbose)
-        waiting = [self._prepare(list(job), initial_job_idx + i) for i, job in enumerate(job_overrides)]
+        common = set.intersection(*map(set, job_overrides)) if len(job_overrides) > 1 else set()
+        waiting = [self._prepare(list(job), initial_job_idx + i, common) for i, job in enumerate(job_overrides)]
         jobs = list(waiting)
         log.info(f"{len(jobs)} jobs, {self.workers} at a time, output in {jobs[0].folder.parent}/*/{Job.OUTPUT}")
         running: list[Job] = []
@@ -79,20 +81,21 @@ class LocalLauncher(Launcher):
                 running = [job for job in running if not job.ended()]
                 time.sleep(0.1)
         except BaseException:
-            for job in running:
-                job.stop()
+            for job in waiting:
+                job.forget()
+            _stop(running)
             raise
         failed = [job for job in jobs if job.returned.status is JobStatus.FAILED]
         if failed:
             raise DexgraspError(
                 f"all {len(jobs)} runs of the multirun to succeed",
                 f"{len(failed)} failed"
-                + "".join(f"\n         {job}: {job.returned._return_value!r}" for job in failed),
+                + "".join(f"\n         {job}: {_told(job.returned._return_value)}" for job in failed),
                 f"see {Job.OUTPUT} in the folder of each; the results of the others are kept",
             )
         return [job.returned for job in jobs]
 
-    def _prepare(self, overrides: list[str], number: int) -> "Job":
+    def _prepare(self, overrides: list[str], number: int, common: set[str]) -> "Job":
         config = self.hydra_context.config_loader.load_sweep_config(self.config, overrides)
         with open_dict(config):
             config.hydra.job.id = config.hydra.job.num = number
@@ -100,7 +103,8 @@ class LocalLauncher(Launcher):
             OmegaConf.select(config, "hydra.sweep.subdir")
         )
         folder.mkdir(parents=True, exist_ok=True)
-        job = Job(" ".join(filter_overrides(overrides)) or "(defaults)", number, folder.absolute(), overrides)
+        label = " ".join(word for word in filter_overrides(overrides) if word not in common)
+        job = Job(label or "(defaults)", number, folder.absolute(), overrides)
         state = (self.hydra_context, self.task_function, config, Singleton.get_state())
         job.file.write_bytes(cloudpickle.dumps(state))
         return job
@@ -154,15 +158,47 @@ class Job:
             returned.return_value = RuntimeError(status)
             return returned
 
-    def stop(self) -> None:
-        """Interrupt the job, and end it where it does not obey."""
-        if self.process is None:  # Ctrl-C while it was being started
-            return
-        self.process.send_signal(signal.SIGINT)
-        try:
-            self.process.wait(PATIENCE)
-        except subprocess.TimeoutExpired:
+    def forget(self) -> None:
+        """Take away what a job that never began has prepared."""
+        self.file.unlink(missing_ok=True)
+        with suppress(OSError):  # the user's, from before
+            self.folder.rmdir()
+
+    def interrupt(self) -> None:
+        """Pass on Ctrl-C."""
+        if self.process is not None:
+            self.process.send_signal(signal.SIGINT)
+
+    def wait(self, seconds: float) -> None:
+        """Wait until the process is over, at most so long."""
+        with suppress(subprocess.TimeoutExpired):
+            if self.process is not None:
+                self.process.wait(seconds)
+
+    def kill(self) -> None:
+        """End the process where it still runs."""
+        if self.process is not None and self.process.poll() is None:
             self.process.kill()
+            self.process.wait()
+
+
+def _stop(jobs: Sequence[Job]) -> None:
+    """Interrupt all jobs at once, so that they save what they have; a second Ctrl-C ends them."""
+    try:
+        for job in jobs:
+            job.interrupt()
+        log.info(f"{len(jobs)} runs are interrupted and save what is done; Ctrl-C again ends them at once")
+        until = time.monotonic() + PATIENCE
+        for job in jobs:
+            job.wait(until - time.monotonic())
+            log.info(f"{job} stopped, see {job.folder / Job.OUTPUT}")
+    finally:
+        for job in jobs:
+            job.kill()
+
+
+def _told(error: Any) -> str:
+    return " ".join(str(error).split()) if isinstance(error, DexgraspError) else repr(error)
 
 
 def run(file: Path, answer: Path) -> None:
@@ -171,13 +207,16 @@ def run(file: Path, answer: Path) -> None:
     file.unlink()
     Singleton.set_state(singletons)
     setup_globals()
-    returned: Any = run_job(
-        hydra_context=context,
-        task_function=task,
-        config=config,
-        job_dir_key="hydra.sweep.dir",
-        job_subdir_key="hydra.sweep.subdir",
-    )
+    try:
+        returned: Any = run_job(
+            hydra_context=context,
+            task_function=task,
+            config=config,
+            job_dir_key="hydra.sweep.dir",
+            job_subdir_key="hydra.sweep.subdir",
+        )
+    except KeyboardInterrupt:  # the command has said what there is to say
+        sys.exit(130)
     if returned.status is JobStatus.FAILED:
         traceback.print_exception(returned._return_value)
     answer.write_bytes(cloudpickle.dumps(returned))

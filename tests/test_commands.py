@@ -127,6 +127,7 @@ def test_help_lists_every_installed_choice(command):
         (["--config-dir", "nowhere"], ["nowhere", "not found"]),
         (["hand.urdf=${package:dexgrasp_nowhere}/a.urdf", "seed=${hand.urdf}"], ["dexgrasp_nowhere"]),
         (["word"], ["key=value", "'word'"]),
+        (["-m", "seed=1,2", "--cfg", "job"], ["one of -m, --cfg", "without -m"]),
     ],
 )
 def test_a_wrong_command_line_is_told_in_one_message(command, wrong, expected):
@@ -253,6 +254,9 @@ class Probe(config.Task):
         if cfg.seed == 9:
             try: time.sleep(60)
             except KeyboardInterrupt: print("saved", flush=True); raise
+        while cfg.seed == 10:
+            try: print(os.getpid(), flush=True); time.sleep(60)
+            except KeyboardInterrupt: print("deaf", flush=True)
 if __name__ == "__main__":
     import probe
     from dexgrasp import __main__ as cli, overrides
@@ -287,7 +291,7 @@ def outputs(runs):
 def test_jobs_run_side_by_side_and_one_may_fail_alone(multirun):
     out, err = (process := multirun("seed=1,7,8,2", "hydra.launcher.workers=2")).communicate(timeout=100)
     assert process.returncode == 2, out + err
-    assert "3 failed" not in err and "2 failed" in err and "ValueError('seven')" in err and "exit status 3" in err
+    assert "2 failed" in err and "#1 (seed=7): ValueError('seven')" in err and "exit status 3" in err
     assert "Traceback" not in err
     found = outputs(multirun.runs)
     assert {key: text.splitlines()[0] for key, text in found.items()} == {
@@ -319,7 +323,26 @@ def test_ctrl_c_reaches_the_jobs_once(multirun):
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130 and "interrupted" in err and "Traceback" not in err
-    assert [text.count("saved") for text in outputs(multirun.runs).values()] == [1, 1], "and the third never began"
+    found = outputs(multirun.runs)
+    assert [text.count("saved") for text in found.values()] == [1, 1], "and the third never began"
+    assert not any("Traceback" in text for text in found.values())
+    assert not list(multirun.runs.glob("*/2")) and not list(multirun.runs.rglob("*.pickle"))
+
+
+def test_a_second_ctrl_c_ends_jobs_that_do_not_obey(multirun):
+    process = multirun("seed=10,10", "hydra.launcher.workers=2")
+    for word in ("says", "deaf"):
+        until = time.monotonic() + 60
+        while sum(word in text for text in outputs(multirun.runs).values()) < 2 and time.monotonic() < until:
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 130 and "Traceback" not in err
+    found = outputs(multirun.runs)
+    assert len(found) == 2
+    for text in found.values():
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(text.splitlines()[1]), 0)
 
 
 def test_threads_are_divided_among_the_jobs(tmp_path):
