@@ -2,10 +2,13 @@
 
 import csv
 import json
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 from dexgrasp.errors import DexgraspError
 
@@ -29,14 +32,17 @@ def read_run(folder: Path, overrides: Sequence[str]) -> Run:
         results = json.loads(path.read_text())
     except (OSError, ValueError) as cause:
         raise DexgraspError(f"results of a finished run in {path}", str(cause), "run that job again") from cause
-    label = dict(override.lstrip("+~").split("=", 1) for override in overrides if "=" in override)
-    return Run(label, folder, results)
+    return Run(_label(overrides), folder, results)
 
 
 def compare(runs: Sequence[Run], folder: Path) -> Path:
-    """Write comparison.md, .csv and .png of `runs` into `folder`, by what differs; return the Markdown's path."""
-    found = sorted({key for run in runs for key in run.label})
-    keys = [key for key in found if len({run.label.get(key) for run in runs}) > 1] or found
+    """Write comparison.md, .csv and .png of `runs` into `folder`, by what differs; return the Markdown's path.
+
+    What differs is told by all runs whose folders lie in `folder`, also by those that failed.
+    """
+    labels = [_label(yaml.safe_load(path.read_text())) for path in folder.glob("*/.hydra/overrides.yaml")]
+    labels += [run.label for run in runs]
+    keys = sorted(key for key in {key for label in labels for key in label} if len({x.get(key) for x in labels}) > 1)
     lines = [[run.label.get(key, "") for key in keys] + _cells(run) for run in runs]
     head = [*keys, "SR %", "CR %", "epsilon", "attempts", "training s", "parameters"]
     table = [
@@ -56,6 +62,10 @@ def compare(runs: Sequence[Run], folder: Path) -> Path:
             writer.writerow([*(run.label.get(key, "") for key in keys), *numbers, run.folder])
     _plot(runs, keys, folder / "comparison.png")
     return path
+
+
+def _label(overrides: Sequence[str]) -> dict[str, str]:
+    return dict(override.lstrip("+~").split("=", 1) for override in overrides if "=" in override)
 
 
 def _summary(run: Run) -> dict[str, Any]:
@@ -90,7 +100,8 @@ def _plot(runs: Sequence[Run], keys: Sequence[str], path: Path) -> None:
             if entry["value"] is not None:
                 reach = [[entry["value"] - entry["low"]], [entry["high"] - entry["value"]]]
                 axes.errorbar(entry["value"], -row, xerr=reach, fmt="o", color="#2b6ca3", capsize=3)
-        labels = ["  ".join(f"{key}={run.label.get(key, '')}" for key in keys) for run in runs]
+        words = [[f"{key.rpartition('.')[2]}={run.label.get(key, '')}" for key in keys] for run in runs]
+        labels = [textwrap.fill("  ".join(each) or run.folder.name, 40) for each, run in zip(words, runs, strict=True)]
         axes.set_yticks([-row for row in range(len(runs))], labels if column == 0 else [""] * len(runs), fontsize=8)
         axes.set_xlim(-0.03, 1.03)
         axes.set_title(title, fontsize=10)

@@ -11,7 +11,7 @@ from dexgrasp.errors import DexgraspError
 
 
 def finished(folder: Path, success: float | None) -> Path:
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     entry = {"value": success, "low": 0.1, "high": 0.9}
     summary = {"success_rate": entry, "completion_rate": entry, "epsilon": entry, "attempts": 6}
     results = {"evaluation": {"summary": summary}, "training": {"seconds": 12.4}, "model": {"parameters": 99}}
@@ -33,6 +33,22 @@ def test_one_line_a_run_and_only_what_differs(tmp_path: Path) -> None:
     assert [row["repr"] for row in rows] == ["contact", "pose"]
     assert float(rows[0]["success_rate_high"]) == 0.9 and rows[1]["success_rate"] == ""
     assert (tmp_path / "comparison.png").stat().st_size > 1000
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_only_run_left_is_told_by_what_was_swept(tmp_path: Path) -> None:
+    same = ["dataset.root=/a/long/folder/that/nobody/compares", "experiment=smoke", "trainer.processes=1"]
+    for number, rate in enumerate(("0.002", "1e12")):
+        (tmp_path / str(number) / ".hydra").mkdir(parents=True)
+        overrides = [*same, f"trainer.learning_rate={rate}", f"objects@dataset.objects={'a-long-name-' * 5}{number}"]
+        (tmp_path / str(number) / ".hydra" / "overrides.yaml").write_text("\n".join(f"- {word}" for word in overrides))
+        if number == 0:
+            run = read_run(finished(tmp_path / "0", 0.5), overrides)
+    path = compare([run], tmp_path)  # the other one failed
+    assert path.read_text().splitlines()[2].startswith("| objects@dataset.objects | trainer.learning_rate | SR %")
+    (tmp_path / "alone").mkdir()
+    path = compare([read_run(finished(tmp_path / "alone" / "0", 0.5), same)], tmp_path / "alone")
+    assert path.read_text().splitlines()[2].startswith("| SR %")
 
 
 def test_a_run_without_results_is_named(tmp_path: Path) -> None:
