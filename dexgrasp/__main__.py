@@ -26,6 +26,9 @@ TOOLS = {
 VERBS = {"dataset": ("inspect", "verify")}
 """First words that make a pipeline's command a tool: the module's `tool(arguments)` runs it."""
 
+VALUED = "--cfg -c --package -p --config-path -cp --config-name -cn --config-dir -cd --experimental-rerun --info -i"
+"""Hydra's flags whose value is the next word."""
+
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; return the exit status (2 for a user's error, 130 for Ctrl-C)."""
@@ -86,7 +89,7 @@ def pipeline(command: str, arguments: list[str]) -> int:
     full = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises instead of printing and exiting: the wording is ours
     config.register()
-    words = [word for word in arguments if not word.startswith("-")]
+    arguments, words = _overrides_last(arguments)
     sys.argv = [f"dexgrasp {command}", *arguments]
     start = hydra.main(version_base="1.3", config_path=str(config.conf_folder()), config_name=command)
     try:
@@ -109,6 +112,15 @@ def pipeline(command: str, arguments: list[str]) -> int:
         if not isinstance(sys.exception(), KeyboardInterrupt):
             config.compare(command)
     return 0
+
+
+def _overrides_last(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Return the arguments with overrides behind all flags, and the overrides: Hydra takes them in one piece only."""
+    flags: list[str] = []
+    words: list[str] = []
+    for before, word in zip(["", *arguments], arguments, strict=False):
+        (flags if word.startswith("-") or before in VALUED.split() else words).append(word)
+    return [*flags, *words], words
 
 
 if __name__ == "__main__":

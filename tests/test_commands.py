@@ -181,6 +181,8 @@ def test_a_hand_in_a_plain_folder_is_a_choice(command):
     status, _, err = command("--config-dir", "../mine", "hand=mine")
     assert status == 0, err
     assert SEEN[-1].hand.urdf == str(folder / "hand/mine.urdf")
+    assert command("seed=7", "--config-dir", "../mine", "hand=mine", "--cfg", "job", "part=large")[0] == 0
+    assert command("seed=7", "--config-dir", "../mine", "hand=mine")[0] == 0 and SEEN[-1].seed == 7
     status, out, _ = command("--config-dir", str(folder), "--help")
     assert next(line for line in out.splitlines() if line.startswith("hand:")) == "hand: " + ", ".join(
         sorted([*plugins_choices("hand"), "mine"])
