@@ -12,6 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from omegaconf import OmegaConf
+from safetensors.torch import load_file
 
 import dexgrasp
 from dexgrasp.dataset.store import Store
@@ -102,3 +105,35 @@ def test_a_killed_training_goes_on_to_the_same_weights(made: Path) -> None:
     assert (folder / "model.safetensors").read_bytes() == (made / "model.safetensors").read_bytes()
     assert (folder / "metrics.csv").read_text() == (made / "metrics.csv").read_text()
     shutil.rmtree(folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("data", [[], ["dataset.seed=1"]], ids=["same data", "other data"])
+def test_fine_tuning_starts_from_the_weights(made: Path, data: list[str]) -> None:
+    home, folder = made.parents[2], made.parent / f"tuned{len(data)}"
+    still = ["trainer.steps=1", "trainer.learning_rate=0.0", "evaluate=false"]
+    status, out, err = run(home, "train", *TINY, *still, *data, f"init_from={made}", f"hydra.run.dir={folder}")
+    assert status == 0, out + err
+    before, after = load_file(made / "model.safetensors"), load_file(folder / "model.safetensors")
+    measured = ("running_mean", "running_var", "num_batches_tracked")
+    learnt = {key for key in before if key.startswith(("backbone.", "representation.")) and not key.endswith(measured)}
+    assert len(learnt) > 20 and learnt <= after.keys()
+    assert all(torch.equal(before[key], after[key]) for key in learnt)
+    assert OmegaConf.load(folder / "config.yaml").init_from == str(made)
+
+
+@pytest.mark.slow
+def test_a_multirun_through_submitit_ends_with_one_table(made: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    words = ["train", "-m", "hydra/launcher=submitit_local", "repr=contact,pose", *TINY]
+    process = start(made.parents[2], *words)
+    out, err = process.communicate(timeout=400)
+    assert process.returncode == 0, out + err
+    folder = Path(out.splitlines()[-1]).parent
+    assert folder.name.endswith("_multirun") and out.count("# Comparison") == 1
+    table = [line for line in (folder / "comparison.md").read_text().splitlines() if line.startswith("|")]
+    assert table[0].startswith("| repr | SR % |")
+    assert [line.split("|")[1].strip() for line in table[2:]] == ["contact", "pose"]
+    rows = list(csv.DictReader((folder / "comparison.csv").open()))
+    assert [row["folder"] for row in rows] == [str(folder / "0"), str(folder / "1")]
+    assert (folder / "comparison.png").stat().st_size > 5000
