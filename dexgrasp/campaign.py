@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dexgrasp.child import end_with_parent
 from dexgrasp.dataset.camera import Viewpoints
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.sensor import Framing, Sensor, capture
@@ -51,7 +52,7 @@ class Campaign:
         The verdicts do not depend on the number of workers.
         """
         count = self.dataset.scenes
-        parallel = joblib.Parallel(n_jobs=workers, return_as="generator")
+        parallel = joblib.Parallel(n_jobs=workers, return_as="generator", initializer=end_with_parent)
         jobs = (joblib.delayed(_work)(self, index, label_ceilings) for index in range(count))
         done = list(track(parallel(jobs), f"evaluation, {self.protocol.name}", total=count))
         episodes = [episode for episode, _ in done]
@@ -80,8 +81,10 @@ class Campaign:
         return capture(meshes, poses, camera, Sensor.build(config["camera"]), framing, stream(seed, "sensor"))
 
     def predict(self, view: View) -> Grasps:
-        """Return the network's grasps, camera frame."""
-        return _network(self.model).predict(view.points, view.normals, self.top_k, self.selection, self.seed)
+        """Return the grasps that the network offers and that are worth trying, camera frame."""
+        network = _network(self.model, self.model.stat().st_mtime_ns)
+        grasps = network.predict(view.points, view.normals, self.top_k, self.selection, self.seed)
+        return grasps if network.scorer is None else grasps[grasps.quality >= self.policy.min_lift]
 
     def reached(self, item: Object, pose: Float[Tensor, "4 4"], grasp: Grasps) -> float:
         """Return epsilon of the contacts in which the fingers end on the true mesh, torque about its centre of mass."""
@@ -130,7 +133,8 @@ def _work(campaign: Campaign, index: int, label_ceilings: bool) -> tuple[Episode
 
 
 @lru_cache(1)
-def _network(path: Path) -> GraspNet:
+def _network(path: Path, stamp: int) -> GraspNet:
+    """`stamp` tells a file from an older one of that name."""
     return load_model(path)
 
 

@@ -126,6 +126,8 @@ def load_start(module: torch.nn.Module, hand: Hand, config: Mapping[str, Any], p
             "the weights of a finished training", f"{path}, which holds something else", f"give its {FILE}"
         )
     check_hand(hand, notes["hand"], path)
+    # A scorer judges the grasps of one network; the new one gets its own.
+    tensors = {key: value for key, value in tensors.items() if not key.startswith("scorer.")}
     trained, now = notes["config"], {key: _plain(config[key]) for key in ("repr", "backbone")}
     other = [f"{kind}={trained[kind]['name']}" for kind in now if trained[kind]["name"] != now[kind]["name"]]
     differing = other or [

@@ -33,7 +33,7 @@ Epsilon = Callable[[Object, Float[Tensor, "4 4"], Grasps], float]
 
 @dataclass(frozen=True)
 class Attempt:
-    """One executed (or missing) grasp."""
+    """One executed grasp, or the look at which none was found, which ends a scene."""
 
     scene: int
     number: int
@@ -65,6 +65,8 @@ class Policy:
     """How many attempts there are, and which of the predicted grasps is executed."""
 
     attempts_per_object: float = 1.5
+    min_lift: float = 0.6
+    """Grasps that the network's scorer thinks less likely to lift are not tried; of no effect without a scorer."""
     distance: float = 0.02
     """A grasp within this distance (m) and angle of one that failed in this scene is passed over once."""
     angle: float = 0.35
@@ -106,8 +108,9 @@ def clear(
         predicted = time.perf_counter()
         seconds = {"render": looked - began, "predict": predicted - looked}
         if chosen is None:
+            # Another look from the same place shows the same: what is left stays, and that counts as a failure.
             attempts.append(Attempt(index, len(attempts), False, "no_grasp", None, None, None, None, seconds))
-            continue
+            break
         seen = _target(chosen, view)
         target = None if seen is None else standing[seen]
         outcome = simulator.execute(objects, poses, hand, chosen, protocol)

@@ -11,6 +11,7 @@ import joblib
 import numpy as np
 import trimesh
 
+from dexgrasp.child import end_with_parent
 from dexgrasp.convex import convex_parts
 from dexgrasp.errors import DexgraspError
 from dexgrasp.objects import Object
@@ -68,7 +69,9 @@ def load_folder(
     if not entries:
         raise DexgraspError(f"meshes under {root}", "none whose name is included", "change include and exclude")
     jobs = (joblib.delayed(_load)(entry, repair, threshold) for entry in entries[:count])
-    results: list[tuple[str, Object | None, str]] = list(joblib.Parallel(n_jobs=workers)(jobs))
+    results: list[tuple[str, Object | None, str]] = list(
+        joblib.Parallel(n_jobs=workers, initializer=end_with_parent)(jobs)
+    )
     objects = [item for _, item, _ in results if item is not None]
     skipped = [(name, note) for name, item, note in results if item is None]
     for name, item, note in results:

@@ -21,10 +21,14 @@ from dexgrasp.checkpoint import (
     write_tensors,
 )
 from dexgrasp.cloud import prepare
+from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
+from dexgrasp.level import carried, level_frame
 from dexgrasp.representation import Prediction, Representation, Targets
+from dexgrasp.scorer import Scorer, coarse_points, surroundings
 from dexgrasp.selection import Selection, select
+from dexgrasp.table import find_table
 
 
 class GraspNet(nn.Module):
@@ -35,7 +39,11 @@ class GraspNet(nn.Module):
         representation: heads on them, and what their numbers mean.
         points: number of points to which a larger cloud is thinned before prediction.
         config: `hand`, `repr` and `backbone` configs from which the parts were built; needed to save.
+
+    `scorer`, where there is one, says how good a told grasp is; else the heads' own score does.
     """
+
+    scorer: Scorer | None
 
     def __init__(
         self,
@@ -48,6 +56,7 @@ class GraspNet(nn.Module):
         self.backbone, self.representation = backbone, representation
         self.points, self.config = points, dict(config or {})
         self.selection = Selection()
+        self.scorer = None
 
     @property
     def hand(self) -> Hand:
@@ -58,23 +67,55 @@ class GraspNet(nn.Module):
     ) -> tuple[Prediction, Int[Tensor, "B M"]]:
         """Return the heads' outputs at all seeds of the batch, (B * M, ...), and the seeds' rows in each cloud.
 
-        `cloud` is position (m, camera frame) and unit normal. The backbone sees each cloud about its mean. `truth`, in
-        training, is the targets of all seeds, see `Representation.forward`.
+        `cloud` is position (m, level frame) and unit normal. The backbone sees each cloud about its mean, but heights
+        as they are. `truth`, in training, is the targets of all seeds, see `Representation.forward`.
         """
-        positions, normals = cloud.split(3, dim=-1)
-        centred = torch.cat([positions - positions.mean(dim=1, keepdim=True), normals], dim=-1)
-        features, seeds = self.backbone(centred, plan)
+        features, seeds = self._features(cloud, plan)
         return self.representation(features.flatten(0, 1), truth), seeds
+
+    def _features(
+        self, cloud: Float[Tensor, "B N 6"], plan: Plan | None
+    ) -> tuple[Float[Tensor, "B M C"], Int[Tensor, "B M"]]:
+        middle = cloud.mean(dim=1, keepdim=True) * cloud.new_tensor([1, 1, 0, 0, 0, 0])
+        return self.backbone(cloud - middle, plan)
+
+    @torch.no_grad()
+    def told(
+        self, cloud: Float[Tensor, "N 6"], plan: Plan | None = None, choices: int = 1, most: int | None = None
+    ) -> tuple[Float[Tensor, "M C"], Int[Tensor, "M"], list[Grasps]]:
+        """Return features and seeds of one cloud (level frame), and grasps at the seeds as the heads tell them.
+
+        One set for each of `choices` answers, at most as many as the representation can give; at the `most` seeds that
+        the heads think most graspable, None: all.
+        """
+        training = self.training
+        self.eval()
+        one = None if plan is None else {key: row[None] for key, row in plan.items()}
+        features, seeds = self._features(cloud[None], one)
+        rows, at = features[0], cloud[seeds[0]]
+        grasps = [self.representation.decode(at[:, :3], at[:, 3:], self.representation(rows))]
+        best = torch.arange(len(rows), device=rows.device)
+        if most is not None:
+            best = grasps[0].quality.argsort(descending=True, stable=True)[:most]
+        rows, at, grasps = rows[best], at[best], [grasps[0][best]]
+        for choice in range(1, min(choices, self.representation.choices)):
+            grasps.append(self.representation.decode(at[:, :3], at[:, 3:], self.representation(rows, choice=choice)))
+        self.train(training)
+        return rows, seeds[0][best], grasps
 
     @torch.no_grad()
     def propose(self, cloud: Float[Tensor, "N 6"], plan: Plan | None = None) -> Grasps:
-        """Return one grasp per seed of one cloud, in its frame, unsorted and unchecked; `quality` is the score."""
-        training = self.training
-        self.eval()
-        prediction, seeds = self(cloud[None], None if plan is None else {key: row[None] for key, row in plan.items()})
-        self.train(training)
-        at = cloud[seeds[0]]
-        return self.representation.decode(at[:, :3], at[:, 3:], prediction)
+        """Return grasps at the seeds of one cloud, unsorted and unchecked; `quality` is the score. Level frame.
+
+        One per seed, or as many as the scorer is used to choosing from.
+        """
+        if self.scorer is None:
+            return self.told(cloud, plan)[2][0]
+        scorer = self.scorer.eval()
+        features, seeds, grasps = self.told(cloud, plan, scorer.choices, scorer.most)
+        at, coarse = cloud[seeds], coarse_points(cloud)
+        logits = [scorer(features, at, told, surroundings(self.hand, told, coarse)) for told in grasps]
+        return Grasps.cat([told.replace(quality=logit.sigmoid()) for told, logit in zip(grasps, logits, strict=True)])
 
     def predict(
         self,
@@ -97,8 +138,11 @@ class GraspNet(nn.Module):
             DexgraspError: NaN or infinite points, fewer than 32, millimetres, wrong shapes.
         """
         cloud = prepare(points, normals, self.points, seed)
-        grasps = self.propose(cloud.to(next(self.parameters()).device)).to("cpu")
-        return select(self.hand, grasps, cloud, top_k, selection or self.selection, seed)
+        table_T_camera = find_table(cloud, seed)
+        level_T_camera = level_frame(cloud, table_T_camera)
+        level = carried(cloud, level_T_camera).to(next(self.parameters()).device)
+        grasps = self.propose(level).to("cpu").moved(inverse(level_T_camera))
+        return select(self.hand, grasps, cloud, top_k, selection or self.selection, table_T_camera)
 
 
 def build_model(config: Mapping[str, Any], points: int = 8192, hand: Hand | None = None) -> GraspNet:
@@ -118,6 +162,7 @@ def save_model(path: Path, model: GraspNet, facts: Mapping[str, Any] | None = No
     """Write weights, config and `facts` (JSON: seed, steps, metrics, ...) to `path`, and the latter to ``.json``."""
     notes = {
         "kind": "model",
+        "scorer": None if model.scorer is None else model.scorer.options,
         "config": {key: _plain(value) for key, value in model.config.items()},
         "points": model.points,
         "hand": kinematics(model.hand),
@@ -144,6 +189,8 @@ def load_model(name_or_path: str | Path, hand: Hand | None = None, device: str |
         check_hand(hand, notes["hand"], path)
     model = build_model(notes["config"], notes["points"], hand)
     check_hand(model.hand, notes["hand"], path)
+    if notes.get("scorer") is not None:
+        model.scorer = Scorer(model.hand, model.backbone.channels, **notes["scorer"])
     load_state(model, tensors, path)
     return model.to(device).eval()
 

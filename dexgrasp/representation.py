@@ -38,6 +38,8 @@ class Representation(nn.Module, ABC):
     hand: Hand
     size: int
     """Number P of parameters."""
+    choices: int = 1
+    """How many answers the heads can give at a point, likeliest first."""
     resolution: tuple[float, float] = (1e-5, 1e-4)
     """How far decode(encode) may move a grasp that can be told: m, rad."""
 
@@ -53,8 +55,8 @@ class Representation(nn.Module, ABC):
         """
 
     @abstractmethod
-    def forward(self, features: Float[Tensor, "N C"], truth: Targets | None = None) -> Prediction:
-        """Run the heads on point features.
+    def forward(self, features: Float[Tensor, "N C"], truth: Targets | None = None, choice: int = 0) -> Prediction:
+        """Run the heads on point features; `choice` of `choices` says which answer is wanted, 0 the likeliest.
 
         In training, `truth` is what the points are labelled with: heads that build on the answers of earlier heads may
         build on the true ones there (teacher forcing). Without it, they build on their own.

@@ -13,7 +13,6 @@ from dexgrasp.execution import pregrasp
 from dexgrasp.geometry import rotation_angle
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
-from dexgrasp.table import find_table
 
 
 @dataclass(frozen=True)
@@ -43,10 +42,16 @@ class Selection:
 
 
 def select(
-    hand: Hand, grasps: Grasps, cloud: Float[Tensor, "N 6"], top_k: int, selection: Selection, seed: int = 0
+    hand: Hand,
+    grasps: Grasps,
+    cloud: Float[Tensor, "N 6"],
+    top_k: int,
+    selection: Selection,
+    table_T_camera: Float[Tensor, "4 4"] | None,
 ) -> Grasps:
-    """Return at most `top_k` grasps (of `cloud`'s frame, camera at its origin), best first.
+    """Return at most `top_k` grasps (of `cloud`'s frame, the camera's), best first.
 
+    `table_T_camera` is the table in the cloud, None where none is seen.
     Candidates are taken in the order of their score and checked lazily, so that good ones cost little.
     """
     finite = grasps.pose.flatten(1).isfinite().all(1) & grasps.joints.isfinite().all(1)
@@ -54,7 +59,7 @@ def select(
     order = torch.argsort(grasps.quality, descending=True, stable=True)[: selection.candidates]
     grasps = grasps[order]
     shape = _shape(hand) if selection.depth is not None or selection.table is not None else None
-    table = find_table(cloud, seed) if selection.table is not None else None
+    table = table_T_camera if selection.table is not None else None
     kept: list[int] = []
     for start, stop in _chunks(len(grasps), top_k):
         if len(kept) >= top_k:

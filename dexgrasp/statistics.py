@@ -1,8 +1,11 @@
-"""95 % intervals for success rates."""
+"""95 % intervals for success rates, and how well a score tells success from failure."""
 
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Bool, Float
+from scipy.stats import rankdata
+from torch import Tensor
 
 from dexgrasp.seeds import stream
 
@@ -35,3 +38,15 @@ def bootstrap_ratio(
     ratios = top[rows].sum(axis=1)[sums > 0] / sums[sums > 0]
     low, high = np.percentile(ratios, [2.5, 97.5])
     return float(low), float(high)
+
+
+def roc_area(scores: Float[Tensor, "N"], truth: Bool[Tensor, "N"]) -> float | None:
+    """Return the area under the ROC: how often a true one scores more than a false one; ties count half.
+
+    None where all are alike.
+    """
+    wins, losses = int(truth.sum()), int((~truth).sum())
+    if not wins or not losses:
+        return None
+    ranks = rankdata(scores.detach().double().cpu().numpy())
+    return float((ranks[truth.cpu().numpy()].sum() - wins * (wins + 1) / 2) / (wins * losses))

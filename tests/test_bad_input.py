@@ -26,6 +26,8 @@ from dexgrasp.representation import Targets
 from dexgrasp.settings import read
 from dexgrasp.training.settings import TrainerSettings
 
+SAME = ["repr=contact", "repr.hidden=[16]", "backbone=pointnet", "backbone.points=32"]
+"""The network of `checkpoint`."""
 FINGERS = ("finger_1_outer", "finger_2_outer", "finger_3_outer")
 
 
@@ -201,6 +203,13 @@ def test_checkpoints(command, checkpoint, tmp_path):
     urdf.write_text(urdf.read_text().replace('multiplier="0.3333333333333333"', 'multiplier="0.5"'))
     words = ["train", "--config-dir", str(tmp_path / "mine"), "hand=mine", f"init_from={checkpoint}"]
     refused(command(*words), "checkpoint of the hand 'mine'", "trained for 'barrett'", "fingertips differ")
+    for other, told in (
+        ("repr=pose", "repr=contact"),
+        ("backbone=pointnet2", "backbone=pointnet"),
+        ("repr.hidden=[8]", r"repr\.hidden=\[16\]"),
+    ):
+        same = [word for word in SAME if word.split("=")[0].split(".")[0] != other.split("=")[0].split(".")[0]]
+        refused(command("train", *same, other, f"init_from={checkpoint}"), f"a network with {told}")
 
 
 def test_resume_takes_the_kept_config_alone(command, tmp_path):

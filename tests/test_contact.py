@@ -224,10 +224,11 @@ def total(terms):
 
 
 @pytest.mark.parametrize("refine", [True, False])
-@pytest.mark.parametrize("separate", [True, False])
-def test_gradients_reach_every_parameter(toy_hand, refine, separate):
+@pytest.mark.parametrize("anchors", [1, 48])
+@pytest.mark.parametrize("conditioned", [True, False])
+def test_gradients_reach_every_parameter(toy_hand, refine, anchors, conditioned):
     torch.manual_seed(1)
-    model = Contact(toy_hand, 32, refine=refine, separate_heads=separate)
+    model = Contact(toy_hand, 32, refine=refine, anchors=anchors, conditioned=conditioned)
     total(model.loss(model(features(63)), some_targets(model, toy_hand))).backward()
     for name, parameter in model.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().sum() > 0, name
@@ -239,10 +240,10 @@ def test_refinement_sees_stage_two(toy_hand):
         model = Contact(toy_hand, 32, refine=refine).eval()
         before = model(features(8))
         with torch.no_grad():
-            model.stage_2.layers[0][-1].bias.add_(1.0)
+            model.stages["own"].layers[0][-1].bias.add_(1.0)
         after = model(features(8))
         assert torch.equal(before["supporting"], after["supporting"]) != refine
-        assert not torch.equal(before["xy"], after["xy"])
+        assert not torch.equal(before["main"], after["main"])
 
 
 def test_truth_loses_no_more_than_anything_else(contact, toy_hand):
@@ -260,7 +261,7 @@ def test_truth_loses_no_more_than_anything_else(contact, toy_hand):
 def test_each_term_answers_to_its_own_outputs(contact, toy_hand):
     targets = some_targets(contact, toy_hand)
     truth = contact.as_prediction(targets)
-    moves = {"finger": {"finger"}, "xy": {"projection"}, "main": {"main", "shared", "supporting"}}
+    moves = {"finger": {"finger"}, "projection": {"projection"}, "main": {"main", "shared", "supporting"}}
     for output, allowed in moves.items():
         wrong = {**truth, output: truth[output].roll(1, dims=0)}
         terms = contact.loss(wrong, targets)
@@ -343,3 +344,53 @@ def test_no_point_is_no_grasp(contact, toy_hand):
     assert len(grasps) == 0 and grasps.pose.shape == (0, 4, 4)
     targets = contact.encode(nothing, nothing, grasps)
     assert targets.parameters.shape == (0, contact.size)
+
+
+def test_a_single_anchor_is_the_paper_s_projection(toy_hand):
+    model = Contact(toy_hand, 32, anchors=1).eval()
+    prediction = model(features(8))
+    assert prediction["projection"].shape == (8, 1, 1, 3)
+    points, normals = unit(8, 40, torch.float32), unit(8, 41, torch.float32)
+    grasps = model.decode(points, normals, prediction)
+    told = model.encode(points, normals, grasps)
+    wanted = prediction["projection"][:, 0, 0, 1:]
+    inside = wanted.norm(dim=1) < 1
+    assert inside.any()
+    torch.testing.assert_close(told.parameters[inside, :2], wanted[inside], atol=1e-4, rtol=0)
+
+
+def test_the_likeliest_anchor_is_told_and_not_a_mean(toy_hand):
+    """Two directions fit a point; the answer is one of them."""
+    model = Contact(toy_hand, 32).eval()
+    points, normals, grasps = manifold_grasps(toy_hand, 1, dtype=torch.float32)
+    targets = model.encode(points, normals, grasps)
+    left, right = torch.tensor([[0.7, 0.0]]), torch.tensor([[-0.7, 0.0]])
+    one, other = (
+        model.as_prediction(targets.replace(parameters=torch.cat([xy, targets.parameters[:, 2:]], dim=1)))
+        for xy in (left, right)
+    )
+    where = other["projection"][..., :1] > 0
+    logits = one["projection"][..., :1] + 1.01 * other["projection"][..., :1]
+    offsets = torch.where(where, other["projection"][..., 1:], one["projection"][..., 1:])
+    grasp = model.decode(points, normals, {**one, "projection": torch.cat([logits, offsets], dim=-1)})
+    torch.testing.assert_close(model.encode(points, normals, grasp).parameters[:, :2], right, atol=1e-4, rtol=0)
+
+
+def test_anchors_are_unit_vectors_spread_over_the_half_sphere(contact):
+    anchors = contact.anchors
+    assert len(anchors) == 48 and (anchors[:, 2] > 0).all()
+    torch.testing.assert_close(anchors.norm(dim=1), torch.ones(48, dtype=torch.float64))
+    directions = unit(4000, 50)
+    directions[:, 2] = directions[:, 2].abs()
+    nearest = torch.acos((directions @ anchors.T).amax(dim=1))
+    assert nearest.max() < 0.4, "no direction is farther than 23 degrees from an anchor"
+
+
+def test_later_stages_run_at_contact_points_only(toy_hand):
+    torch.manual_seed(4)
+    model = Contact(toy_hand, 32)
+    x, targets = features(63), some_targets(Contact(toy_hand, 32), toy_hand)
+    told = model(x, targets)
+    rows = (targets.finger > 0) & targets.encodable
+    assert (told["projection"][~rows] == 0).all() and (told["projection"][rows] != 0).any()
+    assert (told["finger"] != 0).all()

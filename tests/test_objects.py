@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dexgrasp.errors import DexgraspError
-from dexgrasp.objects import ObjectSet, load_objects, object_from_tensors, object_to_tensors, shape
+from dexgrasp.objects import ObjectSet, load_objects, object_from_tensors, object_to_tensors, procedural, shape
 
 
 @pytest.fixture(scope="module")
@@ -66,3 +66,20 @@ def test_pickle_is_exact_and_small() -> None:
 def test_bad_config_is_one_clear_error(config: dict, match: str) -> None:
     with pytest.raises(DexgraspError, match=match):
         load_objects(config)
+
+
+def test_sizes_are_drawn_and_repeat() -> None:
+    natural = procedural("train", 8)
+    varied, again = (procedural("train", 8, 0, (0.5, 2.0), 1.2) for _ in range(2))
+    ratios = []
+    for plain, item, same in zip(natural, varied, again, strict=True):
+        assert item.mesh.is_watertight and np.array_equal(item.mesh.vertices, same.mesh.vertices)
+        ratio = item.mesh.extents / plain.mesh.extents
+        assert (ratio > 0.5 / 1.21).all() and (ratio < 2 * 1.21).all() and ratio.max() / ratio.min() < 1.45
+        assert sum(part.volume for part in item.parts) / item.volume == pytest.approx(
+            sum(part.volume for part in plain.parts) / plain.volume, rel=1e-6
+        )
+        ratios.append(ratio.mean())
+    assert max(ratios) > 1.2 and min(ratios) < 0.8
+    with pytest.raises(DexgraspError, match=r"objects\.size"):
+        procedural("train", 1, 0, (2.0, 1.0))

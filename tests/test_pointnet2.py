@@ -59,11 +59,13 @@ def test_eval_is_independent_of_batch_order_and_shift(factorised, u_shape):
         alone, _ = net(data[1:])
         order = torch.randperm(data.shape[1], generator=torch.Generator().manual_seed(3))
         permuted, new_seeds = net(data[:, order])
-        shifted, _ = net(data + torch.tensor([0.3, -0.2, 0.7, 0, 0, 0]), _stack(net, data))
+        shifted, _ = net(data + torch.tensor([0.3, -0.2, 0.0, 0, 0, 0]), _stack(net, data))
+        raised, _ = net(data + torch.tensor([0.0, 0.0, 0.1, 0, 0, 0]), _stack(net, data))
     torch.testing.assert_close(features[1:], alone, atol=1e-5, rtol=1e-4)
     assert torch.equal(order[new_seeds], seeds)
     torch.testing.assert_close(permuted, features, atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(shifted, features, atol=1e-4, rtol=1e-3)
+    assert not torch.allclose(raised, features, atol=1e-3), "how high a point is, is told"
 
 
 def _stack(net, data):

@@ -63,11 +63,15 @@ def test_select_sorts_limits_and_drops(hand):
     grasps = above(hand, [0.1, 0.2, 0.3, 0.4, 0.5], [0.2, 0.9, 0.4, 0.8, 0.6])
     grasps.pose[3, 0, 3] = float("nan")
     cloud = torch.cat([FAR, torch.tensor([[0.0, 0, -1]])], dim=1)
-    assert select(hand, grasps, cloud, 9, ALL).quality.tolist() == pytest.approx([0.9, 0.6, 0.4, 0.2])
-    assert select(hand, grasps, cloud, 2, ALL).quality.tolist() == pytest.approx([0.9, 0.6])
-    assert select(hand, grasps, cloud, 9, replace(ALL, min_score=0.5)).quality.tolist() == pytest.approx([0.9, 0.6])
-    assert select(hand, grasps, cloud, 9, replace(ALL, candidates=3)).quality.tolist() == pytest.approx([0.9, 0.6, 0.4])
-    assert len(select(hand, grasps[:0], cloud, 9, ALL)) == 0
+    assert select(hand, grasps, cloud, 9, ALL, None).quality.tolist() == pytest.approx([0.9, 0.6, 0.4, 0.2])
+    assert select(hand, grasps, cloud, 2, ALL, None).quality.tolist() == pytest.approx([0.9, 0.6])
+    assert select(hand, grasps, cloud, 9, replace(ALL, min_score=0.5), None).quality.tolist() == pytest.approx(
+        [0.9, 0.6]
+    )
+    assert select(hand, grasps, cloud, 9, replace(ALL, candidates=3), None).quality.tolist() == pytest.approx(
+        [0.9, 0.6, 0.4]
+    )
+    assert len(select(hand, grasps[:0], cloud, 9, ALL, None)) == 0
 
 
 def test_select_drops_the_alike(hand):
@@ -77,7 +81,7 @@ def test_select_drops_the_alike(hand):
         torch.tensor([[half.cos(), -half.sin()], [half.sin(), half.cos()]]) @ grasps.pose[3, :2, :2]
     )
     cloud = torch.cat([FAR, torch.tensor([[0.0, 0, -1]])], dim=1)
-    kept = select(hand, grasps, cloud, 9, Selection(depth=None, table=None))
+    kept = select(hand, grasps, cloud, 9, Selection(depth=None, table=None), None)
     assert kept.quality.tolist() == pytest.approx([0.9, 0.7, 0.6])  # the second is 5 mm from the first, not turned
 
 
@@ -91,5 +95,5 @@ def test_select_checks_lazily_what_free_checks_eagerly(hand, shape):
     passed = grasps[free(hand, shape, grasps, points, None, selection)]
     best = passed[torch.argsort(passed.quality, descending=True)]
     assert 0 < len(passed) < 200
-    assert torch.equal(select(hand, grasps, cloud, 30, selection).pose, best[:30].pose)
-    assert torch.equal(select(hand, grasps, cloud, 500, selection).pose, best.pose)
+    assert torch.equal(select(hand, grasps, cloud, 30, selection, None).pose, best[:30].pose)
+    assert torch.equal(select(hand, grasps, cloud, 500, selection, None).pose, best.pose)

@@ -158,3 +158,16 @@ def test_proposals_do_what_they_say(hand, can):
 def test_settings_are_checked():
     with pytest.raises(DexgraspError, match="shares"):
         SynthesisSettings(approach=0.8, varied=0.5)
+
+
+def test_every_likely_resting_pose_gets_its_share(hand):
+    """A flat box mostly lies on a large side; it is not left with the grasps of how it seldom stands."""
+    box = body(trimesh.creation.box((0.05, 0.07, 0.09)), "brick")
+    grasps, _ = synthesize(hand, box, SynthesisSettings(batch=1024, rounds=8, target=200, epsilon=0.02), 0)
+    shape = HandShape(hand)
+    _, waiting = pregrasp(hand, grasps, SETTINGS.retreat, SETTINGS.opening)
+    poses, likelihoods = box.stable
+    for rest, likelihood in zip(poses, likelihoods, strict=True):
+        lying = torch.from_numpy(rest) @ grasps.pose
+        free = torch.stack([shape.table_distance(lying, j) >= SETTINGS.table for j in (grasps.joints, waiting)]).all(0)
+        assert free.sum() >= 0.5 * likelihood * 200

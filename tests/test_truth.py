@@ -126,3 +126,15 @@ def test_the_scene_has_the_last_word(closer, grasps, ball):
     good, quality = Truth(closer, [ball], HERE, clear=clear).holds(told, grasps)
     assert len(seen) == 1 and len(seen[0]) == free.sum() and (seen[0].object == 0).all()
     assert torch.equal(good.nonzero(), free.nonzero()[::2]) and (quality[~good] == 0).all()
+
+
+def test_outcome_says_what_closing_gives(closer, grasps, ball):
+    free, touched, quality = Truth(closer, [ball], HERE).outcome(grasps)
+    assert free.all() and (touched == 3).all()
+    torch.testing.assert_close(quality, grasps.quality, atol=0.05, rtol=0)
+    away = grasps.replace(pose=grasps.pose + torch.tensor([0, 0, 0, 1.0, *[0] * 12]).reshape(4, 4))
+    free, touched, quality = Truth(closer, [ball], HERE, clear=lambda told: told.quality > 0.2).outcome(away)
+    assert torch.equal(free, grasps.quality > 0.2) and (touched == 0).all() and (quality == 0).all()
+    nowhere = grasps.replace(object=torch.full_like(grasps.object, -1))
+    free, touched, quality = Truth(closer, [ball], HERE).outcome(nowhere)
+    assert not free.any() and (touched == 0).all() and (quality == 0).all()

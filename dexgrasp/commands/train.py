@@ -6,11 +6,12 @@ import time
 from pathlib import Path
 from typing import Any
 
+import joblib
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from dexgrasp.checkpoint import FILE, check_hand, find_checkpoint, load_state, read_tensors
+from dexgrasp.checkpoint import FILE, find_checkpoint, load_start
 from dexgrasp.commands.eval import Settings, evaluate, text
 from dexgrasp.comparison import compare as compare_runs
 from dexgrasp.comparison import read_run
@@ -19,14 +20,15 @@ from dexgrasp.dataset.pipeline import ensure, summary, table
 from dexgrasp.dataset.samples import Samples, collect
 from dexgrasp.dataset.store import digest
 from dexgrasp.errors import DexgraspError
+from dexgrasp.level import levelled
 from dexgrasp.model import GraspNet, build_model, save_model
-from dexgrasp.plugins import build_hand
 from dexgrasp.report import write_results
 from dexgrasp.representation import Targets
 from dexgrasp.seeds import stream
 from dexgrasp.settings import read
 from dexgrasp.training import state
 from dexgrasp.training.loop import device_of, train
+from dexgrasp.training.scoring import ScorerSettings, fit_scorer
 from dexgrasp.training.settings import TrainerSettings
 
 CONFIG = "config.yaml"
@@ -48,18 +50,19 @@ def main(config: DictConfig) -> None:
 def _run(config: DictConfig, folder: Path, began: float) -> None:
     settings = read(TrainerSettings, config.trainer, "trainer")
     device_of(settings)
+    scoring = read(ScorerSettings, config.scorer, "scorer") if config.scorer else None
     if config.evaluate:
         Settings.of(config)
     resumed = (folder / state.FILE).is_file()
     start = None if config.init_from is None or resumed else find_checkpoint(config.init_from)
-    if start is not None:
-        check_hand(build_hand(config.hand), read_tensors(start)[1]["hand"], start)
+    tuned = None
+    if start is not None:  # before any data: what does not fit is told now
+        tuned = build_model(config, config.dataset.views.framing.points)
+        load_start(tuned, tuned.hand, config, start)
     torch.manual_seed(int(stream(config.seed, "weights").integers(2**31)))
     dataset = ensure(config.dataset, config.hand, config.repr)
     print(table(summary(dataset)))
-    model = build_model(config, dataset.config["views"]["framing"]["points"], dataset.hand)
-    if start is not None:
-        load_state(model, read_tensors(start)[0], start)
+    model = tuned or build_model(config, dataset.config["views"]["framing"]["points"], dataset.hand)
     made = time.perf_counter()
     splits = {name: samples(dataset, model, name) for name in ("train", "validation") if dataset.split(name)}
     print(f"{len(splits['train'])} views, {splits['train'].graspable:.1%} of the seed points graspable")
@@ -81,10 +84,18 @@ def _run(config: DictConfig, folder: Path, began: float) -> None:
     }
     facts = {"seed": config.seed, "steps": trained.steps, "validation": trained.validation}
     save_model(folder / FILE, model.cpu(), facts)
+    if scoring is not None:
+        workers = config.dataset.workers or joblib.cpu_count()
+        scored = fit_scorer(model, folder / FILE, dataset, scoring, config.seed, workers)
+        results["scorer"] = dataclasses.asdict(scored)
+        results["times"]["scorer"] = scored.seconds
+        save_model(folder / FILE, model, facts | {"scorer": results["scorer"]})
+        print(f"{scored.holding:.1%} of {scored.proposals} of its grasps hold")
+    scored_at = time.perf_counter()
     if config.evaluate:
         evaluation = evaluate(config, config.hand, folder / FILE, folder / "evaluation")
         results["evaluation"] = {key: value for key, value in evaluation.items() if key != "attempts"}
-        results["times"]["evaluation"] = time.perf_counter() - collected - results["times"]["training"]
+        results["times"]["evaluation"] = time.perf_counter() - scored_at
         print(text(evaluation))
     write_results(folder, "training", results)
     stages = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in results["times"].items())
@@ -112,7 +123,7 @@ def samples(dataset: Dataset, model: GraspNet, split: str) -> Samples:
     """Return what training reads of a split; kept beside the dataset's stages."""
 
     def read(view: int) -> tuple[torch.Tensor, Targets]:
-        seen = dataset.view(view)
+        seen = levelled(dataset.view(view))
         return torch.cat([seen.points, seen.normals], dim=1), dataset.labels(view).targets(len(seen))
 
     labels = dataset.folders["labels"]

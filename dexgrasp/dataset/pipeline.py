@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from omegaconf import OmegaConf
 
+from dexgrasp.child import end_with_parent
 from dexgrasp.dataset import stages
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.store import Item, Shard, Store, digest, lock, write_shard
@@ -28,7 +29,7 @@ from dexgrasp.objects import load_objects
 from dexgrasp.plugins import build_hand, build_representation, load_class
 from dexgrasp.progress import track
 
-REVISION = 2
+REVISION = 4
 """Part of every hash; raised when code changes what the same settings give."""
 STAGES = ("objects", "grasps", "scenes", "views", "labels")
 log = logging.getLogger(__name__)
@@ -185,7 +186,9 @@ def _run(
         log.info("making %s in %s: %d of %d shards are missing", stage, folder, len(store.missing), count)
         began = time.perf_counter()
         workers = settings["workers"] or joblib.cpu_count()
-        parallel = joblib.Parallel(n_jobs=workers, backend=settings["backend"], return_as="generator_unordered")
+        parallel = joblib.Parallel(
+            n_jobs=workers, backend=settings["backend"], return_as="generator_unordered", initializer=end_with_parent
+        )
         pieces = {i: work[i * per_shard : (i + 1) * per_shard] for i in store.missing}
         tasks = (joblib.delayed(_shard)(folder, i, make, piece) for i, piece in pieces.items())
         # Objects are few, large and already in memory.

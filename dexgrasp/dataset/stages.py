@@ -18,6 +18,7 @@ from dexgrasp.dataset.truth import Truth, TruthSettings
 from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
+from dexgrasp.level import levelled
 from dexgrasp.objects import Object, object_to_tensors
 from dexgrasp.plugins import build_representation
 from dexgrasp.seeds import stream
@@ -90,24 +91,30 @@ def make_view(dataset: Dataset, index: int) -> Item:
 
 
 def make_labels(dataset: Dataset, index: int) -> Item:
-    """Tell the grasps of a view in the dataset's representation, keeping what is true."""
+    """Tell the grasps of a view in the dataset's representation and the level frame, keeping what is true."""
     assert dataset.representation is not None
     settings = Settings.read(dataset.config)
-    view, grasps = dataset.view(index), dataset.view_grasps(index)
-    number = dataset.scene_of(index)
-    scene, world_T_camera = dataset.scene(number), view.world_T_camera.double()
-    bodies = [dataset.body(i) for i in dataset.scene_objects(number).tolist()]
-    obstacles = [body.field for body in bodies]
-
-    def is_clear(told: Grasps) -> Tensor:
-        world = told.to(torch.float64).moved(world_T_camera)
-        return clear(dataset.shape, dataset.hand, world, scene.poses, obstacles, settings.approach)
-
-    truth = Truth(dataset.closer, bodies, inverse(world_T_camera) @ scene.poses, settings.truth, is_clear)
+    view, number = levelled(dataset.view(index)), dataset.scene_of(index)
+    world_T_level = view.world_T_camera.double()
+    grasps = dataset.scene_grasps(number).moved(inverse(world_T_level))
+    truth = scene_truth(dataset, number, world_T_level)
     representation = build_representation(dataset.representation, dataset.hand, channels=1)
     found = label(view, grasps, representation, truth.holds, settings.points)
     facts = {"points": len(found), "true": int(found.true.sum()), "grasps": len(grasps)}
     return Item(key(index), found.tensors(), facts)
+
+
+def scene_truth(dataset: Dataset, index: int, world_T_frame: Tensor) -> Truth:
+    """Return the checks of scene `index` for grasps in a frame, `object` counting the scene's objects."""
+    settings, scene = Settings.read(dataset.config), dataset.scene(index)
+    bodies = [dataset.body(i) for i in dataset.scene_objects(index).tolist()]
+    obstacles = [body.field for body in bodies]
+
+    def is_clear(told: Grasps) -> Tensor:
+        world = told.to(torch.float64).moved(world_T_frame)
+        return clear(dataset.shape, dataset.hand, world, scene.poses, obstacles, settings.approach)
+
+    return Truth(dataset.closer, bodies, inverse(world_T_frame) @ scene.poses, settings.truth, is_clear)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Objects become grasps: propose, close, judge, thin (METHOD section 4)."""
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ COARSENESS = 8.0
 PASS = 0.7
 """and pass with this much of the wanted epsilon."""
 ROLLING = 32
-"""At most so many resting poses of an object are looked at."""
+"""At most so many resting poses of an object are looked at: what rolls has many, none of them likely."""
 LEVER = 0.1
 """Turning the base by an angle counts as moving it by angle x this (m) when the telling finger is chosen."""
 
@@ -50,7 +50,7 @@ class SynthesisSettings:
     retreat: float = 0.10
     opening: float = 0.35
     overlap: float = 0.0005
-    resting: float | None = 0.05
+    resting: float | None = 0.95
     table: float = 0.002
     near_position: float = 0.01
     near_angle: float = 0.2
@@ -88,14 +88,13 @@ def synthesize(hand: Hand, item: Object, settings: SynthesisSettings, seed: int)
     the one whose contact tells the pose best (METHOD section 1). The same seed gives the same grasps.
     """
     body = DistanceField.build(item.mesh)
-    tables = None if settings.resting is None else _resting(item, settings.resting)[:, 2]
-    surface = Surface.sample(item, body, settings.spacing, stream(seed, "surface", item.name), tables)
+    surface = Surface.sample(item, body, settings.spacing, stream(seed, "surface", item.name))
     search = _Search(hand, item, surface, settings)
     for number in range(settings.rounds):
         search.round(stream(seed, "synthesis", item.name, number))
-        if len(search.grasps) >= settings.target:
+        if not search.wanting.any():
             break
-    grasps = _spread(search.grasps, settings.target)
+    grasps = search.chosen()
     return grasps, Summary(search.candidates, dict(search.rejected), search.valid, len(grasps), search.note())
 
 
@@ -110,16 +109,30 @@ class _Search:
         )
         self.contacts: Contacts | None = None
         """The proposals, as fingertip contacts, of `grasps`."""
+        self.resting, share = _resting(item, settings.resting)
+        self.wanted = (settings.target * share).ceil().long().clamp(min=-(-settings.target // ROLLING))
+        """(K,) grasps wanted of those that the table leaves free in each resting pose: as it is likely."""
+        self.free = torch.zeros(0, len(share), dtype=torch.bool)
+        """(N, K) in which resting poses each of `grasps` is free."""
+
+    @property
+    def wanting(self) -> Bool[Tensor, "K"]:
+        """Resting poses for which too few grasps are known."""
+        return self.free.sum(dim=0) < self.wanted
 
     def round(self, rng: np.random.Generator) -> None:
         """Propose one batch and keep what is valid and new."""
         settings = self.settings
         count = round(settings.batch * settings.approach)
-        further = round(settings.batch * settings.varied) if self.contacts is not None else 0
+        # What is common is found soon: search on where grasps are wanted, from those that serve there.
+        if settings.resting is not None:
+            self.surface = replace(self.surface, tables=self.resting[self.wanting, 2])
+        parents = self.free[:, self.wanting].any(dim=1).nonzero().flatten()
+        further = round(settings.batch * settings.varied) if len(parents) else 0
         pose, joints = approach(self.hand, self.surface, count, rng)
         told = [contact(self.hand, self.surface, settings.batch - count - further, rng)]
         if self.contacts is not None and further:
-            told.append(varied(self.hand, self.surface, self.contacts, further, rng))
+            told.append(varied(self.hand, self.surface, self.contacts[parents], further, rng))
         contacts = Contacts.cat(told)
         pose = torch.cat([pose, placed(self.hand, self.surface, contacts)])
         joints = torch.cat([joints, opened(self.hand, contacts.joints)])
@@ -144,22 +157,23 @@ class _Search:
         grasps, waiting = self._drop(grasps, ~folded, "hand touches itself"), waiting[~folded]
         clear = self.shape.approach_clear(self.surface.field, grasps.pose, waiting, settings.retreat, settings.overlap)
         grasps, waiting = self._drop(grasps, clear, "way is blocked"), waiting[clear]
-        grasps = self._drop(grasps, self._above_table(grasps, waiting), "under the table")
+        grasps = self._drop(grasps, self._above_table(grasps).any(dim=1), "under the table")
         self.valid += len(grasps)
         return grasps
 
-    def _above_table(self, grasps: Grasps, waiting: Float[Tensor, "N J"]) -> Bool[Tensor, "N"]:
-        """Tell which grasps keep the hand above the table in some likely resting pose of the object."""
+    def _above_table(self, grasps: Grasps) -> Bool[Tensor, "N K"]:
+        """Tell in which resting poses of the object hands stay above the table, closed and opened for the approach."""
         settings = self.settings
         if settings.resting is None:
-            return torch.ones(len(grasps), dtype=torch.bool)
-        reached = torch.zeros(len(grasps), dtype=torch.bool)
-        for pose in _resting(self.item, settings.resting):
-            left = (~reached).nonzero().flatten()
-            lying = pose @ grasps.pose[left]
-            lowest = torch.stack([self.shape.table_distance(lying, j[left]) for j in (grasps.joints, waiting)])
-            reached[left] = (lowest >= settings.table).all(dim=0)
-        return reached
+            return torch.ones(len(grasps), 1, dtype=torch.bool)
+        _, waiting = pregrasp(self.hand, grasps, settings.retreat, settings.opening)
+        free = torch.ones(len(grasps), len(self.resting), dtype=torch.bool)
+        for column, pose in enumerate(self.resting):
+            for joints in (grasps.joints, waiting):
+                rows = free[:, column].nonzero().flatten()
+                lowest = self.shape.table_distance(pose @ grasps.pose[rows], joints[rows])
+                free[rows, column] = lowest >= settings.table
+        return free
 
     def _closed(
         self, body: HandBody, pose: Float[Tensor, "N 4 4"], start: Float[Tensor, "N J"], threshold: float
@@ -193,8 +207,15 @@ class _Search:
         told, contacts = tell(self.hand, self.surface, grasps)
         both = Grasps.cat([self.grasps, told])
         known = contacts if self.contacts is None else Contacts.cat([self.contacts, contacts])
+        free = torch.cat([self.free, self._above_table(told)])
         first = _distinct(both, self.hand, self.settings)
-        self.grasps, self.contacts = both[first], known[first]
+        self.grasps, self.contacts, self.free = both[first], known[first], free[first]
+
+    def chosen(self) -> Grasps:
+        """Return the grasps best spread, as many for each resting pose as are wanted of it."""
+        order = _spread(self.grasps)
+        rank = self.free[order].cumsum(dim=0)
+        return self.grasps[order[(self.free[order] & (rank <= self.wanted)).any(dim=1)]]
 
     def note(self) -> str:
         if len(self.grasps):
@@ -203,12 +224,18 @@ class _Search:
         return f"none of {self.candidates} candidates on {self.item.name} is a grasp ({reasons})"
 
 
-def _resting(item: Object, least: float) -> Float[Tensor, "K 4 4"]:
-    """Return the resting poses world_T_object that count, likeliest first."""
+def _resting(item: Object, share: float | None) -> tuple[Float[Tensor, "K 4 4"], Float[Tensor, "K"]]:
+    """Return the likeliest resting poses world_T_object, together at least `share` likely, and how likely each is.
+
+    Where it is None there is no table: one pose stands for all.
+    """
+    if share is None:
+        return torch.eye(4, dtype=torch.float64)[None], torch.ones(1, dtype=torch.float64)
     poses, likelihoods = item.stable
-    # What rolls has many resting poses, none of them likely: some of the likeliest stand for all.
     order = np.argsort(-likelihoods, kind="stable")[:ROLLING]
-    return torch.from_numpy(poses[order[likelihoods[order] >= min(least, likelihoods.max() / 2)]])
+    count = int(np.searchsorted(likelihoods[order].cumsum(), share * likelihoods[order].sum())) + 1
+    likely = torch.from_numpy(likelihoods[order[:count]])
+    return torch.from_numpy(poses[order[:count]]), likely / likely.sum()
 
 
 def tell(hand: Hand, surface: Surface, grasps: Grasps) -> tuple[Grasps, Contacts]:
@@ -248,15 +275,14 @@ def _distinct(grasps: Grasps, hand: Hand, settings: SynthesisSettings) -> Int[Te
     return order[torch.from_numpy(first)].sort().values
 
 
-def _spread(grasps: Grasps, target: int) -> Grasps:
+def _spread(grasps: Grasps) -> Int[Tensor, "N"]:
     """Order grasps so that every part of the object and every direction comes first once, its best grasp first."""
     if not len(grasps):
-        return grasps
+        return torch.zeros(0, dtype=torch.long)
     axes = torch.cat([grasps.contacts.mean(dim=1) / 0.015, grasps.pose[:, :3, 2] / 0.5], dim=1).floor().long()
     _, cell = np.unique(axes.numpy(), axis=0, return_inverse=True)
     order = np.lexsort((-grasps.quality.numpy(), cell.reshape(-1)))
     sorted_cells = cell.reshape(-1)[order]
     starts = np.flatnonzero(np.r_[True, sorted_cells[1:] != sorted_cells[:-1]])
     rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
-    final = order[np.lexsort((-grasps.quality.numpy()[order], rank))]
-    return grasps[torch.from_numpy(final[:target].copy())]
+    return torch.from_numpy(order[np.lexsort((-grasps.quality.numpy()[order], rank))])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dexgrasp.distance import DistanceField
@@ -17,7 +17,7 @@ from dexgrasp.grasps import Grasps
 from dexgrasp.quality import epsilon, wrenches
 
 if TYPE_CHECKING:
-    from dexgrasp.closing import Closer
+    from dexgrasp.closing import Closer, Closure
 
 Clear = Callable[[Grasps], Bool[Tensor, "N"]]
 """Grasps in the frame of `Truth` -> which are clear of table and neighbours."""
@@ -108,11 +108,35 @@ class Truth:
             good[rows] = self.clear(told[rows].replace(object=original.object[rows]))
         return good, torch.where(good, quality, 0.0)
 
+    def outcome(self, grasps: Grasps) -> tuple[Bool[Tensor, "N"], Int[Tensor, "N"], Float[Tensor, "N"]]:
+        """Close grasps on their own `object`; return which are clear, how many fingers touch, and epsilon.
+
+        Nothing is clear or touches where the object is -1; epsilon is 0 where the closed hand penetrates.
+        """
+        limits = self.settings
+        free, touched = grasps.object >= 0, torch.zeros(len(grasps), dtype=torch.long)
+        quality = torch.zeros_like(grasps.quality)
+        rows = free.nonzero().flatten()
+        if self.clear is not None and len(rows):
+            free[rows] = self.clear(grasps[rows])
+        for number in grasps.object[grasps.object >= 0].unique().tolist():
+            rows, body = (grasps.object == number).nonzero().flatten(), self.bodies[number]
+            closure = self._closed(grasps[rows], number)
+            touched[rows] = closure.touched.sum(dim=1)
+            cones = wrenches(closure.contacts, closure.normals, body.com, body.radius, limits.friction, limits.edges)
+            found = torch.as_tensor(epsilon(cones)).to(quality)
+            quality[rows] = torch.where(closure.penetration <= limits.penetration, found, 0.0)
+        return free, touched, quality
+
+    def _closed(self, grasps: Grasps, index: int) -> "Closure":
+        _, opened = pregrasp(self.closer.hand, grasps, opening=self.settings.opening)
+        motion = self.object_T_frame[index]
+        return self.closer.close(self.bodies[index].field, motion @ grasps.pose.double(), opened.double())
+
     def _closed_quality(self, grasps: Grasps, index: int) -> Float[Tensor, "N"]:
         """Return epsilon of grasps of one object after closing again; 0 where a check fails."""
         limits, body = self.settings, self.bodies[index]
-        _, opened = pregrasp(self.closer.hand, grasps, opening=limits.opening)
-        closure = self.closer.close(body.field, self.object_T_frame[index] @ grasps.pose.double(), opened.double())
+        closure = self._closed(grasps, index)
         good = (closure.touched & closure.on_tip).all(dim=1) & (closure.penetration <= limits.penetration)
         quality = grasps.quality.new_zeros(len(grasps))
         if good.any():

@@ -31,6 +31,12 @@ class Solid:
         affine = np.column_stack([rotation, shift])
         return Solid(self.body.transform(affine), tuple(part @ rotation.T + shift for part in self.parts))
 
+    def scaled(self, factors: ArrayLike) -> "Solid":
+        """Stretch along the axes by positive factors."""
+        scale = np.asarray(factors, dtype=float)
+        body = self.body.transform(np.column_stack([np.diag(scale), np.zeros(3)]))
+        return Solid(body, tuple(part * scale for part in self.parts))
+
 
 def octasphere(steps: int) -> Points:
     """Unit directions of a subdivided octahedron, 4 steps^2 + 2 of them, the axes among them."""

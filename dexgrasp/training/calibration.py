@@ -20,7 +20,7 @@ def calibrate(model: GraspNet, samples: Samples, settings: TrainerSettings, seed
     for step in range(max(1, settings.calibrate // settings.batch)):
         for indices in order(len(samples), settings, seed, step):
             batch = samples.batch(indices).to(device)
-            model(batch.cloud, batch.plan)
+            model(batch.cloud, batch.plan, batch.targets)
     for norm, momentum in zip(norms, momenta, strict=True):
         norm.momentum = momentum
     model.eval()

@@ -6,7 +6,6 @@ anew for the averaged weights at the end. The order of views depends on seed and
 """
 
 import copy
-import ctypes
 import math
 import os
 import signal
@@ -23,6 +22,7 @@ import torch.multiprocessing
 from torch import Tensor, nn
 
 from dexgrasp.checkpoint import read_tensors
+from dexgrasp.child import end_with_parent
 from dexgrasp.dataset.samples import Batch, Samples
 from dexgrasp.errors import DexgraspError
 from dexgrasp.model import GraspNet
@@ -93,7 +93,7 @@ def train(
 
 def _child(rank: int, errors: Any, *work: Any) -> None:
     """One process of several: errors that users shall read go to the parent as they are."""
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG: or we would train on when the parent is killed
+    end_with_parent()  # or we would train on when it is killed
     try:
         _run(rank, *work)
     except DexgraspError as error:

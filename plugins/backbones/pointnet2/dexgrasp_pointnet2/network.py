@@ -11,11 +11,15 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.sampling import farthest_points, neighbours
 from dexgrasp_pointnet2.layers import FeaturePropagation, SetAbstraction, mlp
 
+HEIGHT = 10.0
+"""Heights (m) times this are numbers of order one, as normals are."""
+
 
 class PointNet2(Backbone):
     """PointNet++ with features at the points of its first level (METHOD section 3).
 
-    Positions enter only relative to their ball's centre, so features do not change when a cloud is shifted.
+    Positions enter only relative to their ball's centre and by their height, so features do not change when a cloud is
+    shifted sideways.
 
     Args:
         points: number of centres of each set abstraction level, falling; the first are the seeds.
@@ -23,7 +27,8 @@ class PointNet2(Backbone):
         neighbours: points taken of each ball: the nearest ones within the radius.
         widths: layer sizes of each level's MLP.
         decoder: layer sizes of each feature propagation, coarsest first; one less than levels.
-        stem: size of a layer on the normals before the first level; 0 for none.
+        stem: size of a layer on the points' own inputs before the first level; 0 for none.
+        height: the points' own inputs are normal and height (z); else the normal alone, as published.
         factorised: take the maximum behind each level's first layer (fast) instead of its last (as published).
         u_shape: propagate level by level with skip connections; otherwise the coarsest features are interpolated
             straight onto the seeds (the paper's ablation).
@@ -37,6 +42,7 @@ class PointNet2(Backbone):
         widths: Sequence[Sequence[int]] = ((64, 64, 64), (128, 128, 128), (192, 192, 192), (256, 256, 256)),
         decoder: Sequence[Sequence[int]] = ((192,), (128,), (128,)),
         stem: int = 32,
+        height: bool = True,
         factorised: bool = True,
         u_shape: bool = True,
     ) -> None:
@@ -51,10 +57,11 @@ class PointNet2(Backbone):
         self.points, self.radii, self.neighbours = tuple(points), tuple(radii), tuple(neighbours)
         self.u_shape = u_shape
         outputs = [width[-1] for width in widths]
-        self.stem = mlp((3, stem)) if stem else nn.Identity()
+        self.height, inputs = height, 4 if height else 3
+        self.stem = mlp((inputs, stem)) if stem else nn.Identity()
         self.encoder = nn.ModuleList(
             SetAbstraction(channels, width, factorised)
-            for channels, width in zip([stem or 3, *outputs], widths, strict=False)
+            for channels, width in zip([stem or inputs, *outputs], widths, strict=False)
         )
         if not u_shape:
             decoder = decoder[-1:]
@@ -90,7 +97,8 @@ class PointNet2(Backbone):
         batch = len(cloud)
 
         levels = [cloud[..., :3].flatten(0, 1)]
-        features = [self.stem(cloud[..., 3:].flatten(0, 1))]
+        own = torch.cat([cloud[..., 3:], HEIGHT * cloud[..., 2:3]], dim=-1) if self.height else cloud[..., 3:]
+        features = [self.stem(own.flatten(0, 1))]
         for i, layer in enumerate(self.encoder):
             size = len(levels[i]) // batch
             centres = levels[i][_flat(plan[f"sample_{i}"], size)]

@@ -1,13 +1,15 @@
 """A grasp told from one fingertip contact: finger projection, main joints, supporting joints."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from dexgrasp.contact_frame import place, project
+from dexgrasp.errors import DexgraspError
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.heads import (
@@ -27,6 +29,8 @@ from dexgrasp.representation import Prediction, Representation, Targets
 
 OWN, SHARED, SUPPORTING = range(3)
 """What a joint slot of a finger is."""
+FEWEST = 16
+"""Fewer contact points than this in a micro-batch: the heads behind the first run at all points."""
 
 
 class Contact(Representation):
@@ -34,7 +38,7 @@ class Contact(Representation):
 
     What a slot means depends on the finger (paper: theta_ms, theta_m, theta_s1, theta_s2); each keeps the hand's
     order. Three stages (paper, figure 3): which finger touches, if any; projection and main joints; supporting
-    joints. Angles in rad.
+    joints. Angles in rad. In training, stages 2 and 3 run at contact points only.
 
     The representation is lossy: it assumes that the contact normal lies in the finger's flexion plane.
 
@@ -44,11 +48,13 @@ class Contact(Representation):
         per_finger: tell projection and joints for each finger, so that the one that touches picks its own; else once,
             as in the paper.
         refine: predict supporting joints from features and the outputs of stages 1 and 2; else from features alone.
-        conditioned: each stage also sees what was decided before it, as one-hot classes: stage 2 the finger and the
-            bins of shared joints (which it tells first), stage 3 all bins of main joints. In training these are the
-            true ones. Where several grasps fit a point, the numbers then belong to one of them, not to their mean.
-        hidden: widths of the hidden layers of each MLP.
-        separate_heads: an MLP for each output, as in the paper; else the outputs of a stage share hidden layers.
+        anchors: the projection is told as the likeliest of so many directions, spread evenly over the half sphere above
+            the tangent plane, and an offset from its (x, y); 1: as (x, y) outright, as in the paper. Where several
+            grasps fit a point, one of them is told and not their mean.
+        conditioned: each head also sees what was decided before it, as one-hot classes: finger, anchor, bins of shared
+            joints, bins of the finger's own joints. In training these are the true ones. All numbers then belong to
+            one grasp.
+        hidden: widths of the hidden layers of each MLP, one per head.
         bins, shared_bins, joint_bins: see `JointBins`.
         alpha, beta, gamma: weights of finger identity, finger projection and joints.
         gamma_m, gamma_ms, gamma_s: weights of the finger's own main joints, of main joints that all fingers share
@@ -67,9 +73,9 @@ class Contact(Representation):
         *,
         per_finger: bool = False,
         refine: bool = True,
+        anchors: int = 48,
         conditioned: bool = True,
         hidden: Sequence[int] = (128,),
-        separate_heads: bool = False,
         bins: int = 7,
         shared_bins: int = 12,
         joint_bins: Mapping[str, int] | None = None,
@@ -105,21 +111,28 @@ class Contact(Representation):
         self.order: Tensor
         self.kind: Tensor
 
+        if anchors < 1:
+            raise DexgraspError("repr.anchors of at least 1", str(anchors), "1 tells (x, y) outright")
+        self.register_buffer("anchors", _half_sphere(anchors), persistent=False)
+        self.anchors: Tensor
+        self.choices = anchors
+
         self.versions, self.conditioned = len(hand.fingers) if per_finger else 1, conditioned
-        each = 2 * self.joints.most * self.versions
-        known = len(hand.fingers) if conditioned else 0
-        first = {"finger": len(hand.fingers) + 1}
-        shared = {"first": each * len(self.first_slots)}
-        second = {"xy": 2 * self.versions, "second": each * len(self.second_slots)}
-        third = {"supporting": each * len(self.supporting_slots)}
-        self.stage_1 = Heads(channels, first, hidden, separate=separate_heads)
-        self.stage_2_shared = Heads(channels + known, shared, hidden, separate=separate_heads)
-        known += self.joints.most * len(self.first_slots)
-        self.stage_2 = Heads(channels + known, second, hidden, separate=separate_heads)
-        if refine:
-            known += self.joints.most * len(self.second_slots) if conditioned else 0
-            known += sum((first | shared | second).values())
-        self.stage_3 = Heads(channels + (known if refine else 0), third, hidden, separate=separate_heads)
+        fingers, each = len(hand.fingers), 2 * self.joints.most * self.versions
+        self.slots = {"shared": self.first_slots, "own": self.second_slots, "supporting": self.supporting_slots}
+        sizes = {"finger": fingers + 1, "projection": 3 * anchors * self.versions}
+        sizes |= {name: each * len(slots) for name, slots in self.slots.items()}
+        # What each head sees of those before it, beside the features.
+        decided = {"finger": fingers, "projection": anchors}
+        decided |= {name: self.joints.most * len(slots) for name, slots in self.slots.items()}
+        known = [sum(list(decided.values())[:number]) if conditioned else 0 for number in range(len(sizes))]
+        known[-1] = known[-1] + sum(list(sizes.values())[:-1]) if refine else 0
+        self.stages = nn.ModuleDict(
+            {
+                name: Heads(channels + extra, {name: size}, hidden, separate=True)
+                for (name, size), extra in zip(sizes.items(), known, strict=True)
+            }
+        )
 
     def encode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grasps: Grasps) -> Targets:
         """Tell N grasps; `encodable` is False where z <= 0, or where no finger was chosen (then `finger` is 0).
@@ -149,57 +162,89 @@ class Contact(Representation):
         logits, residuals = self._joint_outputs(outputs)
         slots[:, told] = self.joints.join(logits, residuals, joint[:, told])
         joints = torch.empty_like(slots).scatter(-1, joint, slots)
-        base = place(self.hand, finger, points, normals, outputs["xy"], joints)
+        xy = self._told_xy(outputs["projection"], outputs["projection"][..., 0].argmax(-1))
+        base = place(self.hand, finger, points, normals, xy, joints)
         return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0])
 
-    def forward(self, features: Float[Tensor, "N C"], truth: Targets | None = None) -> Prediction:
-        """Run the three stages: finger (N, F + 1) logits, xy (N, V, 2), main and supporting (N, V, slots, 2, bins).
+    def forward(self, features: Float[Tensor, "N C"], truth: Targets | None = None, choice: int = 0) -> Prediction:
+        """Run the three stages; `choice` takes another than the likeliest anchor, the less likely the higher it is.
 
-        V is F with `per_finger`, else 1; bins are logits, then residuals.
+        Returns finger (N, F + 1) logits, projection (N, V, anchors, 3): logit and offset of (x, y), main and supporting
+        (N, V, slots, 2, bins): logits and residuals. V is F with `per_finger`, else 1.
         """
-        told = self.stage_1(features)
-        finger = told["finger"][:, 1:].argmax(-1)
-        if truth is not None:
-            finger = torch.where(truth.finger > 0, truth.finger - 1, finger)
-        known = [F.one_hot(finger, len(self.hand.fingers)).to(features)] if self.conditioned else []
-        told |= self.stage_2_shared(torch.cat([features, *known], dim=-1))
-        first = self._unflat(told["first"], len(self.first_slots))
-        if self.conditioned:
-            known += self._decided(first, finger, self.first_slots, truth)
-        told |= self.stage_2(torch.cat([features, *known], dim=-1))
-        second = self._unflat(told["second"], len(self.second_slots))
-        if self.conditioned and self.refine:
-            known += self._decided(second, finger, self.second_slots, truth)
-        before = torch.cat([features, *known, *told.values()], dim=-1) if self.refine else features
-        told |= self.stage_3(before)
-        position = [(self.first_slots + self.second_slots).index(slot) for slot in self.main_slots]
-        return {
-            "finger": told["finger"],
-            "xy": told["xy"].unflatten(-1, (self.versions, 2)),
-            "main": torch.cat([first, second], dim=2)[:, :, position],
-            "supporting": self._unflat(told["supporting"], len(self.supporting_slots)),
+        outputs = self.stages["finger"](features)
+        if truth is None:
+            return outputs | self._tell(features, outputs["finger"], None, choice)
+        rows = contact_points(truth)
+        if len(rows) < FEWEST:  # too few for batch statistics
+            return outputs | self._tell(features, outputs["finger"], truth)
+        told = self._tell(features[rows], outputs["finger"][rows], truth[rows])
+        return outputs | {
+            name: value.new_zeros(len(features), *value.shape[1:]).index_copy(0, rows, value)
+            for name, value in told.items()
         }
 
-    def _unflat(self, outputs: Tensor, slots: int) -> Tensor:
-        return outputs.unflatten(-1, (self.versions, slots, 2, self.joints.most))
+    def _tell(
+        self, features: Float[Tensor, "N C"], classes: Float[Tensor, "N K"], truth: Targets | None, choice: int = 0
+    ) -> Prediction:
+        """Run stages 2 and 3, head by head, each knowing what was decided before it."""
+        finger = classes[:, 1:].argmax(-1)
+        if truth is not None:
+            finger = torch.where(truth.finger > 0, truth.finger - 1, finger)
+        known = [F.one_hot(finger, len(self.hand.fingers)).to(features)]
+        raw = {"finger": classes}
+        shaped: Prediction = {}
+        for name in ("projection", *self.slots):
+            seen = [features, *(known if self.conditioned else [])]
+            if name == "supporting":
+                seen = [*seen, *raw.values()] if self.refine else [features]
+            raw |= self.stages[name](torch.cat(seen, dim=-1))
+            shape = (len(self.anchors), 3) if name == "projection" else (len(self.slots[name]), 2, self.joints.most)
+            shaped[name] = raw[name].unflatten(-1, (self.versions, *shape))
+            if name == "projection" and choice:
+                shaped[name] = _without_likeliest(shaped[name], choice)
+            if self.conditioned and name != "supporting":
+                known.append(self._decided(name, shaped[name], finger, truth))
+        position = [(self.first_slots + self.second_slots).index(slot) for slot in self.main_slots]
+        return {
+            "projection": shaped["projection"],
+            "main": torch.cat([shaped["shared"], shaped["own"]], dim=2)[:, :, position],
+            "supporting": shaped["supporting"],
+        }
 
     def _decided(
-        self, outputs: Tensor, finger: Int[Tensor, "N"], slots: list[int], truth: Targets | None
-    ) -> list[Float[Tensor, "N D"]]:
-        """Return the one-hot bins of some slots: the true ones where they are known, else the likeliest."""
+        self, name: str, outputs: Tensor, finger: Int[Tensor, "N"], truth: Targets | None
+    ) -> Float[Tensor, "N D"]:
+        """Return one-hot which anchor, or which bins, were decided: the true ones where known, else the likeliest."""
+        own = of_finger({"": outputs.detach()}, finger)[""]
+        if name == "projection":
+            chosen = own[..., 0].argmax(-1)
+            true = chosen if truth is None else self._anchor(truth.parameters[:, :2])
+            chosen = chosen if truth is None else torch.where(truth.finger > 0, true, chosen)
+            return F.one_hot(chosen, len(self.anchors)).to(outputs)
+        slots = self.slots[name]
         if not slots:
-            return []
+            return own.new_zeros(len(own), 0)
         joint = self.order[finger][:, slots]
-        logits = of_finger({"": outputs}, finger)[""][..., 0, :]
-        chosen = self.joints.likeliest(logits, joint)
+        chosen = self.joints.likeliest(own[..., 0, :], joint)
         if truth is not None:
             true, _ = self.joints.split(truth.parameters[:, 2:][:, slots], joint)
             chosen = torch.where((truth.finger > 0).unsqueeze(-1), true, chosen)
-        return [F.one_hot(chosen, self.joints.most).to(outputs).flatten(1)]
+        return F.one_hot(chosen, self.joints.most).to(outputs).flatten(1)
+
+    def _anchor(self, xy: Float[Tensor, "N 2"]) -> Int[Tensor, "N"]:
+        """Return the anchor nearest to each direction."""
+        z = (1 - xy.square().sum(-1, keepdim=True)).clamp(min=0).sqrt()
+        return (torch.cat([xy, z], dim=-1) @ self.anchors.to(xy).T).argmax(-1)
+
+    def _told_xy(self, projection: Float[Tensor, "N A 3"], anchor: Int[Tensor, "N"]) -> Float[Tensor, "N 2"]:
+        offset = projection[torch.arange(len(anchor), device=anchor.device), anchor, 1:]
+        return self.anchors[anchor, :2].to(offset) + offset
 
     def loss(self, prediction: Prediction, targets: Targets) -> dict[str, Tensor]:
         """Return METHOD section 2's terms: finger, projection, main, shared, supporting.
 
+        The projection's is |xy_p - xy_l| from the true anchor, and cross-entropy on the anchor where there are several.
         Points that are graspable but not encodable count nowhere; all terms but the first count contact points only.
         """
         known, contact = known_points(targets), contact_points(targets)
@@ -212,7 +257,9 @@ class Contact(Representation):
         outputs = of_finger({name: value[contact] for name, value in prediction.items()}, finger)
         logits, residuals = self._joint_outputs(outputs)
         joints = self.joints.loss(logits, residuals, truth[:, 2:][:, told], joint, huber=self.huber)
-        projection = torch.linalg.vector_norm(outputs["xy"].to(truth) - truth[:, :2], dim=-1)
+        anchor = self._anchor(truth[:, :2])
+        projection = torch.linalg.vector_norm(self._told_xy(outputs["projection"], anchor) - truth[:, :2], dim=-1)
+        projection = projection + F.cross_entropy(outputs["projection"][..., 0], anchor, reduction="none")
         terms = {"finger": self.alpha * classes, "projection": self.beta * mean(projection)}
         for index, (name, weight) in enumerate(self.gammas.items()):
             terms[name] = self.gamma * weight * mean(joints * (kind == index))
@@ -222,7 +269,11 @@ class Contact(Representation):
         """Return what a perfect network would put out."""
         finger = (targets.finger - 1).clamp(min=0)
         classes = CERTAIN * F.one_hot(targets.finger, len(self.hand.fingers) + 1).to(targets.parameters)
-        outputs = {"xy": targets.parameters[:, :2]}
+        xy = targets.parameters[:, :2]
+        anchor = self._anchor(xy)
+        logits = CERTAIN * F.one_hot(anchor, len(self.anchors)).to(xy)
+        offset = (xy - self.anchors[anchor, :2].to(xy)).unsqueeze(1).expand(-1, len(self.anchors), -1)
+        outputs = {"projection": torch.cat([logits.unsqueeze(-1), offset], dim=-1)}
         for name, slots in (("main", self.main_slots), ("supporting", self.supporting_slots)):
             told = self.joints.as_prediction(targets.parameters[:, 2:][:, slots], self.order[finger][:, slots])
             outputs[name] = torch.stack(told, dim=-2)
@@ -231,6 +282,24 @@ class Contact(Representation):
     def _joint_outputs(self, outputs: Prediction) -> tuple[Tensor, Tensor]:
         logits, residuals = torch.cat([outputs["main"], outputs["supporting"]], dim=1).unbind(-2)
         return logits, residuals
+
+
+def _without_likeliest(projection: Float[Tensor, "N V A 3"], count: int) -> Float[Tensor, "N V A 3"]:
+    """Rule out the `count` likeliest anchors."""
+    logits, offsets = projection.split([1, 2], dim=-1)
+    best = logits.topk(count, dim=2).indices
+    return torch.cat([logits.scatter(2, best, torch.finfo(logits.dtype).min), offsets], dim=-1)
+
+
+def _half_sphere(count: int) -> Float[Tensor, "A 3"]:
+    """Return unit vectors spread evenly over z > 0 on a golden spiral; a single one is +z."""
+    if count == 1:
+        return torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    number = torch.arange(count, dtype=torch.float64)
+    z = 1 - (number + 0.5) / count
+    turn = math.pi * (3 - 5**0.5) * number
+    radius = (1 - z * z).sqrt()
+    return torch.stack([radius * turn.cos(), radius * turn.sin(), z], dim=-1)
 
 
 def _kinds(hand: Hand) -> Int[Tensor, "F J"]:

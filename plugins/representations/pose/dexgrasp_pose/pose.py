@@ -108,7 +108,7 @@ class Pose(Representation):
         base = geometry.pose(rotation, points + self.scale * outputs["offset"])
         return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0])
 
-    def forward(self, features: Float[Tensor, "N C"], truth: Targets | None = None) -> Prediction:
+    def forward(self, features: Float[Tensor, "N C"], truth: Targets | None = None, choice: int = 0) -> Prediction:
         """Return finger (N, F + 1) logits, offset (N, V, 3), rotation (N, V, 6), joints (N, V, slots, 2, bins).
 
         V is F with `per_finger`, else 1; bins are logits, then residuals. No head builds on another's answer.

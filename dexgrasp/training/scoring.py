@@ -1,0 +1,194 @@
+"""Teaching the scorer: the network's own grasps on the training's views, judged on the true objects."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import joblib
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from dexgrasp.batch import Batch
+from dexgrasp.child import end_with_parent
+from dexgrasp.dataset.dataset import Dataset
+from dexgrasp.dataset.stages import scene_truth
+from dexgrasp.errors import DexgraspError
+from dexgrasp.grasps import Grasps
+from dexgrasp.level import levelled
+from dexgrasp.model import GraspNet, load_model
+from dexgrasp.progress import track
+from dexgrasp.scorer import COARSE, Scorer, coarse_points, surroundings
+from dexgrasp.seeds import stream, torch_stream
+from dexgrasp.selection import free
+from dexgrasp.statistics import roc_area
+
+DRAWN = 3
+"""So many times the grasps wanted of a view are drawn: most meet what the camera sees."""
+SPREAD = 2048
+"""Points of a view of which none may lie in the open hand: fewer than in prediction, to save time."""
+
+
+@dataclass(frozen=True)
+class ScorerSettings:
+    """`conf/scorer`; see there for what each value does."""
+
+    choices: int = 3
+    most: int = 640
+    hidden: tuple[int, ...] = (256, 128)
+    around: tuple[int, ...] = (32, 64)
+    per_view: int = 200
+    views: int | None = None
+    epochs: int = 4
+    batch: int = 2048
+    learning_rate: float = 0.004
+    weight_decay: float = 0.01
+    clear: tuple[float, ...] = (0.06, 0.38, 0.80, 0.96)
+    blocked: tuple[float, ...] = (0.06, 0.27, 0.64, 0.78)
+
+    def __post_init__(self) -> None:
+        for name in ("choices", "most", "per_view", "epochs", "batch"):
+            if getattr(self, name) < 1:
+                raise DexgraspError(f"scorer.{name} of at least 1", str(getattr(self, name)), f"set scorer.{name}")
+        for name in ("clear", "blocked"):
+            worth = getattr(self, name)
+            if len(worth) != 4 or not all(0 <= value <= 1 for value in worth):
+                raise DexgraspError(f"scorer.{name}: four shares in 0..1", str(worth), f"set scorer.{name}")
+
+
+@dataclass(frozen=True)
+class Proposals(Batch):
+    """Grasps that a network proposed, where it did, and what became of them."""
+
+    features: Float[Tensor, "N C"]
+    at: Float[Tensor, "N 6"]
+    """Point (m) and normal, level frame."""
+    pose: Float[Tensor, "N 4 4"]
+    """level_T_base, m."""
+    joints: Float[Tensor, "N J"]
+    around: Float[Tensor, "N K 7"]
+    """What lies about the hand, see `dexgrasp.scorer.surroundings`; half precision."""
+    score: Float[Tensor, "N"]
+    """Probability of graspable as the heads tell it."""
+    worth: Float[Tensor, "N"]
+    """How likely the grasp is to lift, by how it closes on the true object."""
+    holds: Bool[Tensor, "N"]
+    """It is clear of everything and reaches the epsilon of synthesis."""
+
+
+@dataclass(frozen=True)
+class ScorerSummary:
+    """What the scorer saw and what it is worth on views that it did not see."""
+
+    proposals: int
+    holding: float
+    """Share of the proposals that hold."""
+    seconds: float
+    area: float | None = None
+    """Area under the ROC on validation views."""
+    area_before: float | None = None
+    """The same of the heads' own score."""
+
+
+def fit_scorer(
+    model: GraspNet, path: Path, dataset: Dataset, settings: ScorerSettings, seed: int, workers: int
+) -> ScorerSummary:
+    """Give `model` (on the CPU, as it lies at `path`) a scorer taught on the dataset's training views.
+
+    The result does not depend on the number of workers.
+    """
+    began = time.perf_counter()
+    known = _propose(path, dataset, dataset.split("train")[: settings.views], settings, seed, workers, "scorer")
+    if not len(known):  # nothing to learn from: the heads' own score stays
+        return ScorerSummary(0, 0.0, time.perf_counter() - began)
+    torch.manual_seed(int(stream(seed, "scorer").integers(2**31)))
+    scorer = Scorer(
+        model.hand, known.features.shape[1], settings.choices, settings.most, settings.hidden, settings.around
+    )
+    _fit(scorer, known, settings, seed)
+    model.scorer = scorer
+    areas: tuple[float | None, ...] = (None, None)
+    if dataset.split("validation"):
+        unseen = _propose(path, dataset, dataset.split("validation"), settings, seed, workers, "scorer, validation")
+        with torch.no_grad():
+            told = scorer(unseen.features, unseen.at, _grasps(unseen), unseen.around)
+        areas = roc_area(told, unseen.holds), roc_area(unseen.score, unseen.holds)
+    return ScorerSummary(len(known), float(known.holds.double().mean()), time.perf_counter() - began, *areas)
+
+
+def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) -> None:
+    scorer.train()
+    optimizer = torch.optim.AdamW(
+        scorer.parameters(), settings.learning_rate, weight_decay=settings.weight_decay, fused=False
+    )
+    size = min(settings.batch, len(known))
+    steps = settings.epochs * (len(known) // size)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, settings.learning_rate, total_steps=steps + 1)
+    order = torch_stream(seed, "scorer order")
+    for _ in range(settings.epochs):
+        shuffled = torch.randperm(len(known), generator=order)
+        for start in range(0, len(known) - size + 1, size):
+            rows = known[shuffled[start : start + size]]
+            logits = scorer(rows.features, rows.at, _grasps(rows), rows.around)
+            loss = F.binary_cross_entropy_with_logits(logits, rows.worth)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+    scorer.eval()
+
+
+def _grasps(known: Proposals) -> Grasps:
+    return Grasps.build(known.pose, known.joints, 1)
+
+
+def _propose(
+    path: Path, dataset: Dataset, views: Sequence[int], settings: ScorerSettings, seed: int, workers: int, label: str
+) -> Proposals:
+    parallel = joblib.Parallel(n_jobs=workers, return_as="generator", initializer=end_with_parent)
+    stamp = path.stat().st_mtime_ns
+    jobs = (joblib.delayed(_of_view)(path, stamp, dataset, view, settings, seed) for view in views)
+    return Proposals.cat(list(track(parallel(jobs), label, total=len(views))))
+
+
+@torch.no_grad()
+def _of_view(path: Path, stamp: int, dataset: Dataset, index: int, settings: ScorerSettings, seed: int) -> Proposals:
+    """Return some of the grasps told in one view, judged; the worker's only entry."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        model, hand = _network(path, stamp), dataset.hand
+        view = levelled(dataset.view(index))
+        cloud = torch.cat([view.points, view.normals], dim=1)
+        features, seeds, told = model.told(cloud, choices=settings.choices, most=settings.most)
+        grasps = Grasps.cat(told).replace(object=view.instance[seeds].repeat(len(told)))
+        # On objects, where it is hard to tell; a few elsewhere, so that the table is known not to be graspable.
+        order = torch.from_numpy(stream(seed, "proposals", index).permutation(len(grasps)))
+        on = grasps.object[order] >= 0
+        rows = torch.cat([order[on][: DRAWN * settings.per_view], order[~on][: settings.per_view // 10]])
+        # What prediction rules out by itself teaches nothing.
+        coarse, table = coarse_points(cloud, SPREAD), torch.eye(4, dtype=torch.float64)
+        passed = free(hand, dataset.shape, grasps[rows], coarse[:, :3], table, model.selection)
+        rows = rows[passed][: settings.per_view]
+        grasps, at = grasps[rows], rows % len(seeds)
+        truth = scene_truth(dataset, dataset.scene_of(index), view.world_T_camera.double())
+        clear, touched, quality = truth.outcome(grasps)
+        least = truth.settings.epsilon
+        # 0: one finger or none, 1: several but no force closure, 2: force closure, 3: as good as synthesis asks for.
+        kind = (touched > 1).long() + (quality > 0) + (quality >= least)
+        worth = torch.where(clear, torch.tensor(settings.clear)[kind], torch.tensor(settings.blocked)[kind])
+        holds = clear & (quality >= least)
+        around = surroundings(hand, grasps, coarse[:COARSE]).half()
+        scores = grasps.quality
+        return Proposals(features[at], cloud[seeds[at]], grasps.pose, grasps.joints, around, scores, worth, holds)
+    finally:
+        torch.set_num_threads(threads)
+
+
+@lru_cache(1)
+def _network(path: Path, stamp: int) -> GraspNet:
+    """`stamp` tells a file from an older one of that name."""
+    return load_model(path)

@@ -1,0 +1,151 @@
+"""The scorer: what it sees of a hand's surroundings, and how a network with one proposes."""
+
+import math
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+import dexgrasp
+from dexgrasp import config as settings
+from dexgrasp.dataset.pipeline import ensure
+from dexgrasp.errors import DexgraspError
+from dexgrasp.geometry import axis_angle, pose
+from dexgrasp.grasps import Grasps
+from dexgrasp.model import GraspNet, build_model, load_model, save_model
+from dexgrasp.scorer import COARSE, NEAREST, Scorer, coarse_points, surroundings
+from dexgrasp.selection import Selection
+from dexgrasp.statistics import roc_area
+from dexgrasp.training import scoring
+from dexgrasp.training.scoring import ScorerSettings
+
+TINY = [
+    "dataset=smoke",
+    "dataset.objects.count=2",
+    "dataset.synthesis.target=100",
+    "dataset.synthesis.rounds=2",
+    "dataset.scenes.count=4",
+    "dataset.scenes.counts=[2]",
+    "dataset.views.framing.points=2048",
+]
+OPEN = Selection(depth=None, table=None)
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return dexgrasp.load_hand("barrett")
+
+
+def network(points: int) -> GraspNet:
+    settings.register()
+    with initialize_config_dir(str(settings.conf_folder()), version_base="1.3"):
+        config = compose("train", overrides=["backbone=pointnet", "backbone.points=256"])
+    torch.manual_seed(0)
+    return build_model(config, points=points).eval()
+
+
+def some(hand, count=5):
+    generator = torch.Generator().manual_seed(0)
+    axis = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    turned = axis_angle(axis, 3 * torch.rand(count, generator=generator))
+    lower, upper = hand.limits.float().unbind(-1)
+    joints = lower + (upper - lower) * torch.rand(count, len(lower), generator=generator)
+    return Grasps.build(pose(turned, 0.1 * torch.randn(count, 3, generator=generator)), joints, 3)
+
+
+def scene(count=1500, seed=0):
+    """Halves of balls on a table 0.6 m below the camera, camera frame."""
+    generator = torch.Generator().manual_seed(seed)
+    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    direction[:, 2] = -direction[:, 2].abs()
+    centres = torch.tensor([[0.0, 0.0, 0.56], [0.12, 0.05, 0.56], [-0.1, 0.08, 0.56]])
+    balls = centres[torch.randint(3, (count,), generator=generator)] + 0.04 * direction
+    table = torch.rand(count, 3, generator=generator) * torch.tensor([0.5, 0.5, 0.0])
+    table = table + torch.tensor([-0.25, -0.25, 0.6])
+    return torch.where(torch.rand(count, 1, generator=generator) < 0.5, balls, table)
+
+
+def cloud(count=1000):
+    points = scene(count, 4)
+    return torch.cat([points, torch.nn.functional.normalize(-points, dim=1)], dim=1)
+
+
+def test_surroundings_are_the_nearest_points_in_the_palm_s_frame(hand):
+    grasps, points = some(hand), coarse_points(cloud())
+    assert points.shape == (COARSE, 6)
+    around = surroundings(hand, grasps, points)
+    assert around.shape == (5, NEAREST, 7)
+    for row in range(5):
+        palm = (grasps.pose[row] @ hand.base_T_palm.float()).double()
+        tips = (grasps.pose[row] @ hand.fingertips(grasps.joints[row : row + 1])[0].float())[:, :3, 3].mean(0)
+        nearest = (points[:, :3] - tips).norm(dim=1).argsort()[:NEAREST]
+        local = (torch.linalg.inv(palm)[:3, :3] @ (points[nearest, :3].double() - palm[:3, 3]).T).T / 0.1
+        torch.testing.assert_close(around[row, :, :3].double(), local, atol=1e-4, rtol=0)
+        torch.testing.assert_close(around[row, :, 6], points[nearest, 2] / 0.1)
+
+
+def test_a_scene_turned_about_the_vertical_looks_the_same_to_the_hand(hand):
+    grasps, points = some(hand), coarse_points(cloud())
+    turn = pose(axis_angle(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(0.7)), torch.tensor([0.3, -0.2, 0.0]))
+    rotation = turn[:3, :3].T
+    moved = torch.cat([points[:, :3] @ rotation + turn[:3, 3], points[:, 3:] @ rotation], dim=1)
+    torch.testing.assert_close(
+        surroundings(hand, grasps.moved(turn), moved), surroundings(hand, grasps, points), atol=1e-4, rtol=0
+    )
+
+
+def test_few_points_are_enough(hand):
+    assert surroundings(hand, some(hand), coarse_points(cloud(40))).shape == (5, 40, 7)
+
+
+def test_a_network_with_a_scorer_chooses_from_several_answers(tmp_path):
+    model, points = network(1024), scene()
+    plain = model.predict(points, top_k=500, selection=OPEN)
+    torch.manual_seed(5)
+    model.scorer = Scorer(model.hand, model.backbone.channels, choices=3, most=100).eval()
+    grasps = model.predict(points, top_k=500, selection=OPEN)
+    assert (grasps.quality.diff() <= 0).all() and not torch.equal(grasps.pose[:5], plain.pose[:5])
+    proposed = model.propose(cloud())
+    assert len(proposed) == 300, "three answers at each of the hundred points that are most graspable"
+    first, second = proposed.pose[:100], proposed.pose[100:200]
+    assert not torch.isclose(first, second).flatten(1).all(dim=1).any()
+    save_model(tmp_path / "model.safetensors", model)
+    again = load_model(tmp_path / "model.safetensors").predict(points, top_k=500, selection=OPEN)
+    assert torch.equal(again.pose, grasps.pose) and torch.equal(again.quality, grasps.quality)
+
+
+def test_it_learns_from_what_holds_and_leaves_the_network_as_it_is(tmp_path, monkeypatch):
+    """Dataset and network are real and small; what meets the cloud counts too, or an untrained network has nothing."""
+    monkeypatch.setattr(scoring, "free", lambda hand, shape, grasps, *_: torch.ones(len(grasps), dtype=torch.bool))
+    settings.register()
+    with initialize_config_dir(str(settings.conf_folder()), version_base="1.3"):
+        config = compose("dataset", overrides=[*TINY, f"dataset.root={tmp_path / 'data'}"])
+    dataset = ensure(config.dataset, config.hand, config.repr)
+    model = network(2048)
+    save_model(tmp_path / "model.safetensors", model)
+    told = ScorerSettings(choices=2, most=200, per_view=60, epochs=2, batch=32)
+    before = {key: value.clone() for key, value in model.state_dict().items()}
+    found = []
+    for _ in range(2):
+        summary = scoring.fit_scorer(model, tmp_path / "model.safetensors", dataset, told, 0, 1)
+        found.append({key: value.clone() for key, value in model.state_dict().items()})
+    assert summary.proposals > 20 and 0 <= summary.holding <= 1
+    assert {key for key in found[0]} > set(before), "a scorer came in addition"
+    assert all(torch.equal(found[0][key], found[1][key]) for key in found[0])
+    assert all(torch.equal(found[0][key], value) for key, value in before.items()), "the network is as it was"
+
+
+def test_settings_are_checked():
+    for change in ({"choices": 0}, {"clear": (0.1, 0.2)}, {"blocked": (0.1, 0.2, 0.3, 1.5)}):
+        with pytest.raises(DexgraspError, match=f"scorer.{next(iter(change))}"):
+            ScorerSettings(**change)
+
+
+def test_roc_area():
+    truth = torch.tensor([False, False, True, True])
+    assert roc_area(torch.tensor([0.1, 0.2, 0.3, 0.4]), truth) == 1
+    assert roc_area(torch.tensor([0.4, 0.3, 0.2, 0.1]), truth) == 0
+    assert roc_area(torch.tensor([0.5, 0.5, 0.5, 0.5]), truth) == 0.5
+    assert roc_area(torch.tensor([0.1, 0.3, 0.2, 0.4]), truth) == 0.75
+    assert roc_area(torch.ones(4), torch.ones(4, dtype=torch.bool)) is None
+    assert not math.isnan(roc_area(torch.rand(100), torch.rand(100) > 0.5))
