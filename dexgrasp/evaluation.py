@@ -67,9 +67,9 @@ class Policy:
     attempts_per_object: float = 1.5
     min_lift: float = 0.6
     """Grasps that the network's scorer thinks less likely to lift are not tried; of no effect without a scorer."""
-    distance: float = 0.02
-    """A grasp within this distance (m) and angle of one that failed in this scene is passed over once."""
-    angle: float = 0.35
+    distance: float = 0.03
+    """A grasp within this distance (m) and angle of one that failed in this scene is not tried."""
+    angle: float = 0.5
     """rad"""
 
 
@@ -135,7 +135,7 @@ def clear(
         if success:
             removed.append(names[row])
             after[row] = math.nan
-        failed = [] if success else [*failed, chosen]
+        failed += [] if success else [chosen]
         poses = simulator.settle(objects, after, _seed(seed, "settle", index, len(attempts))).to(poses)
     return Episode(index, names, tuple(removed), tuple(attempts), tuple(strips))
 
@@ -146,15 +146,13 @@ def present(poses: Float[Tensor, "O 4 4"]) -> list[int]:
 
 
 def choose(offered: Grasps, failed: Sequence[Grasps], policy: Policy) -> Grasps | None:
-    """Return the best offered grasp (world frame) that does not repeat a failed one; the best where all do."""
-    if len(offered) == 0:
-        return None
+    """Return the best offered grasp (world frame) that does not repeat a failed one, None where there is none."""
     fresh = torch.ones(len(offered), dtype=torch.bool)
     for grasp in failed:
         near = torch.linalg.vector_norm(offered.pose[:, :3, 3] - grasp.pose[:, :3, 3], dim=1) < policy.distance
         alike = rotation_angle(offered.pose[:, :3, :3], grasp.pose[:, :3, :3]) < policy.angle
         fresh &= ~(near & alike)
-    return offered[int(fresh.nonzero()[0, 0]) if fresh.any() else 0]
+    return offered[int(fresh.nonzero()[0, 0])] if fresh.any() else None
 
 
 def ceilings(
