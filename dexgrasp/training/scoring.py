@@ -121,9 +121,7 @@ def fit_scorer(
 
 def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) -> None:
     scorer.train()
-    optimizer = torch.optim.AdamW(
-        scorer.parameters(), settings.learning_rate, weight_decay=settings.weight_decay, fused=False
-    )
+    optimizer = torch.optim.AdamW(scorer.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
     size = min(settings.batch, len(known))
     steps = settings.epochs * (len(known) // size)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, settings.learning_rate, total_steps=steps + 1)
