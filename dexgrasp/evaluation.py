@@ -65,7 +65,7 @@ class Policy:
     """How many attempts there are, and which of the predicted grasps is executed."""
 
     attempts_per_object: float = 1.5
-    min_lift: float = 0.6
+    min_lift: float = 0.5
     """Grasps that the network's scorer thinks less likely to lift are not tried; of no effect without a scorer."""
     distance: float = 0.03
     """A grasp within this distance (m) and angle of one that failed in this scene is not tried."""
