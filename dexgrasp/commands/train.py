@@ -89,7 +89,9 @@ def _run(config: DictConfig, folder: Path, began: float) -> None:
         scored = fit_scorer(model, folder / FILE, dataset, scoring, config.seed, workers)
         results["scorer"] = dataclasses.asdict(scored)
         results["times"]["scorer"] = scored.seconds
-        save_model(folder / FILE, model, facts | {"scorer": results["scorer"]})
+        # Without the time that it took: a run that was interrupted ends with the same file.
+        worth = {key: value for key, value in results["scorer"].items() if key != "seconds"}
+        save_model(folder / FILE, model, facts | {"scorer": worth})
         print(f"{scored.holding:.1%} of {scored.proposals} of its grasps hold")
     scored_at = time.perf_counter()
     if config.evaluate:
