@@ -120,6 +120,8 @@ def fit_scorer(
 
 
 def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) -> None:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # sums that are cut up otherwise end in other bits
     scorer.train()
     optimizer = torch.optim.AdamW(scorer.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
     size = min(settings.batch, len(known))
@@ -137,6 +139,7 @@ def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) 
             optimizer.step()
             schedule.step()
     scorer.eval()
+    torch.set_num_threads(threads)
 
 
 def _grasps(known: Proposals) -> Grasps:
