@@ -14,11 +14,11 @@ class TriangleTree(NamedTuple):
     """A mesh as arrays that compiled code reads; triangles stand in the order of the tree's leaves."""
 
     boxes: np.ndarray
-    """(M, 6) lower and upper corner of each node, m; node 0 is the root, a left child follows its parent."""
-    right: np.ndarray
-    """(M,) right child; for a leaf -1 - (first triangle)."""
-    sizes: np.ndarray
-    """(M,) triangles of a leaf, 0 for inner nodes."""
+    """(M, 6) lower and upper corner of each node, m, in pre-order; node 0 is the root."""
+    skips: np.ndarray
+    """(M,) the next node that is not below this one: a leaf's is the node after it."""
+    firsts: np.ndarray
+    """(M + 1,) the first triangle below each node."""
     corners: np.ndarray
     """(T, 3, 3) corners of the triangles, m."""
     normals: np.ndarray
@@ -29,8 +29,8 @@ def triangle_tree(mesh: trimesh.Trimesh) -> TriangleTree:
     """Return the tree of a mesh (m)."""
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     corners = np.ascontiguousarray(vertices[faces])
-    order, boxes, right, sizes = _build(corners)
-    return TriangleTree(boxes, right, sizes, corners[order], _pseudonormals(corners, faces)[order])
+    order, boxes, skips, firsts = _build(corners)
+    return TriangleTree(boxes, skips, firsts, corners[order], _pseudonormals(corners, faces)[order])
 
 
 def _pseudonormals(corners: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -61,18 +61,22 @@ def _build(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     count = len(corners)
     order = np.arange(count)
     boxes = np.empty((2 * count + 1, 6))
-    right = np.empty(2 * count + 1, np.int64)
-    sizes = np.zeros(2 * count + 1, np.int64)
-    stack = np.empty((128, 3), np.int64)  # first triangle, end, parent whose right child this is
-    stack[0] = (0, count, -1)
-    top, nodes = 1, 0
+    skips, firsts = np.empty(2 * count + 1, np.int64), np.empty(2 * count + 1, np.int64)
+    waiting = np.empty((128, 2), np.int64)  # first triangle and end of nodes that are not made yet
+    above = np.empty((128, 2), np.int64)  # nodes above, and their ends
+    waiting[0] = (0, count)
+    top, nodes, depth = 1, 0, 0
     while top:
         top -= 1
-        first, end, parent = stack[top]
+        first, end = waiting[top]
         node = nodes
         nodes += 1
-        if parent >= 0:
-            right[parent] = node
+        while depth and above[depth - 1, 1] <= first:
+            depth -= 1
+            skips[above[depth, 0]] = node
+        above[depth] = (node, end)
+        depth += 1
+        firsts[node] = first
         axis, widest = 0, -1.0
         for k in range(3):
             low, high, inner, outer = np.inf, -np.inf, np.inf, -np.inf
@@ -87,17 +91,19 @@ def _build(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
             if outer - inner > widest:
                 axis, widest = k, outer - inner
         if end - first <= LEAF:
-            right[node], sizes[node] = -1 - first, end - first
             continue
         middles = np.empty(end - first)
         for t in range(first, end):
             middles[t - first] = corners[order[t], 0, axis] + corners[order[t], 1, axis] + corners[order[t], 2, axis]
         order[first:end] = order[first:end][np.argsort(middles)]
         half = (first + end) // 2
-        stack[top] = (half, end, node)
-        stack[top + 1] = (first, half, -1)
+        waiting[top] = (half, end)
+        waiting[top + 1] = (first, half)
         top += 2
-    return order, boxes[:nodes].copy(), right[:nodes].copy(), sizes[:nodes].copy()
+    for k in range(depth):
+        skips[above[k, 0]] = nodes
+    firsts[nodes] = count
+    return order, boxes[:nodes].copy(), skips[:nodes].copy(), firsts[: nodes + 1].copy()
 
 
 @njit(cache=True)
@@ -138,7 +144,7 @@ def to_triangle(corners: np.ndarray, t: int, x: float, y: float, z: float) -> tu
 
 
 @njit(cache=True)
-def _to_box(boxes: np.ndarray, node: int, x: float, y: float, z: float) -> float:
+def to_box(boxes: np.ndarray, node: int, x: float, y: float, z: float) -> float:
     dx = max(boxes[node, 0] - x, x - boxes[node, 3], 0.0)
     dy = max(boxes[node, 1] - y, y - boxes[node, 4], 0.0)
     dz = max(boxes[node, 2] - z, z - boxes[node, 5], 0.0)
@@ -152,36 +158,20 @@ def nearest(tree: TriangleTree, x: float, y: float, z: float, seed: int, out: np
     `seed` is a triangle that is probably near. The normal is the direction of steepest distance; on the surface
     itself it is the pseudonormal.
     """
-    boxes, right, sizes, corners, normals = tree
+    boxes, skips, firsts, corners, normals = tree
     best, v, w, feature = to_triangle(corners, seed, x, y, z)
     triangle = seed
-    stack = np.empty(64, np.int64)
-    keys = np.empty(64)
-    stack[0], keys[0] = 0, _to_box(boxes, 0, x, y, z)
-    top = 1
-    while top:
-        top -= 1
-        if keys[top] >= best:
+    node, count = 0, len(boxes)
+    while node < count:
+        if to_box(boxes, node, x, y, z) >= best:
+            node = skips[node]
             continue
-        node = stack[top]
-        size = sizes[node]
-        if size:
-            first = -1 - right[node]
-            for t in range(first, first + size):
+        if skips[node] == node + 1:
+            for t in range(firsts[node], firsts[node + 1]):
                 square, v_t, w_t, feature_t = to_triangle(corners, t, x, y, z)
                 if square < best:
                     best, v, w, feature, triangle = square, v_t, w_t, feature_t, t
-            continue
-        one, two = node + 1, right[node]
-        near, far = _to_box(boxes, one, x, y, z), _to_box(boxes, two, x, y, z)
-        if near > far:
-            one, two, near, far = two, one, far, near
-        if far < best:
-            stack[top], keys[top] = two, far
-            top += 1
-        if near < best:
-            stack[top], keys[top] = one, near
-            top += 1
+        node += 1
     nx, ny, nz = normals[triangle, feature, 0], normals[triangle, feature, 1], normals[triangle, feature, 2]
     distance = np.sqrt(best)
     for k in range(3):
