@@ -11,8 +11,10 @@ import pytest
 import safetensors.torch
 import torch
 
-from dexgrasp.dataset import store as module
-from dexgrasp.dataset.store import Item, Store, digest, lock, write_shard
+from dexgrasp.dataset import shard as module
+from dexgrasp.dataset.claims import claim, lock
+from dexgrasp.dataset.shard import Item, write_shard
+from dexgrasp.dataset.store import Store, digest, recorded
 from dexgrasp.errors import DexgraspError
 
 CONFIG = {"a": 1, "b": {"c": [1.5, "x"]}}
@@ -29,6 +31,7 @@ def filled(folder: Path, shards: int = 3) -> Store:
     store = Store.create(folder, "test", CONFIG, 0, shards)
     for i in store.missing:
         store.add(i, store.write_shard(i, items(3 * i)))
+    store.finish()
     return store
 
 
@@ -157,3 +160,38 @@ def test_a_killed_holder_frees_the_lock(tmp_path: Path) -> None:
     with lock(tmp_path / "store"):
         pass
     assert (tmp_path / "log").read_text() == "in "
+
+
+def test_runs_with_a_share_keep_out_those_without(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("fork")
+    with lock(tmp_path / "store", shared=True), lock(tmp_path / "store", shared=True):
+        run = context.Process(target=_hold, args=(tmp_path / "store", tmp_path / "log"))
+        run.start()
+        time.sleep(0.3)
+        assert not (tmp_path / "log").exists()
+    run.join()
+    assert (tmp_path / "log").read_text() == "in out "
+
+
+def test_a_claim_is_one_process_s(tmp_path: Path) -> None:
+    with claim(tmp_path / "x") as ours, claim(tmp_path / "x") as again, claim(tmp_path / "y") as other:
+        assert ours and other and not again
+    with claim(tmp_path / "x") as ours:
+        assert ours
+
+
+def test_shards_written_elsewhere_are_seen(tmp_path: Path) -> None:
+    store = Store.create(tmp_path, "test", CONFIG, 0, 3)
+    assert recorded(tmp_path, 1) is None
+    shard = write_shard(tmp_path, 1, items(3))
+    assert recorded(tmp_path, 1) == shard and shard.memory > 1e6
+    assert Store.create(tmp_path, "test", CONFIG, 0, 3, alone=False).missing == [0, 2]
+    (tmp_path / shard.file).unlink()
+    assert recorded(tmp_path, 1) is None and Store.create(tmp_path, "test", CONFIG, 0, 3).missing == [0, 1, 2]
+    store = filled(tmp_path)
+    assert recorded(tmp_path, 2) is not None and store.missing == []
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        ".manifest.json.lock",
+        "manifest.json",
+        *(f"shard-0000{i}.tar" for i in range(3)),
+    ]

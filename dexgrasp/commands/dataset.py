@@ -24,9 +24,11 @@ def main(config: DictConfig) -> None:
     from hydra.core.hydra_config import HydraConfig
 
     from dexgrasp.dataset import pipeline
+    from dexgrasp.dataset.making import Share
 
     try:
-        dataset = pipeline.ensure(config.dataset, config.hand, config.repr if config.labels else None)
+        share = Share(config.part, config.parts)
+        dataset = pipeline.ensure(config.dataset, config.hand, config.repr if config.labels else None, share)
     except KeyboardInterrupt:
         print("what is done is kept; go on with the same command", file=sys.stderr)
         raise

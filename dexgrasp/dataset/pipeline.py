@@ -5,34 +5,29 @@ stage before. So whatever fits is found again, by any run, and whatever does not
 """
 
 import hashlib
-import logging
 import math
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import joblib
 import numpy as np
-import torch
 from omegaconf import OmegaConf
 
-from dexgrasp.child import end_with_parent
-from dexgrasp.dataset import stages
+from dexgrasp.dataset import stages, workers
 from dexgrasp.dataset.dataset import Dataset
-from dexgrasp.dataset.store import Item, Shard, Store, digest, lock, write_shard
+from dexgrasp.dataset.making import Share, Stage, make_store
+from dexgrasp.dataset.store import Store, digest
 from dexgrasp.errors import DexgraspError
 from dexgrasp.hand import Hand
 from dexgrasp.objects import load_objects
 from dexgrasp.plugins import build_hand, build_representation, load_class
-from dexgrasp.progress import track
 
 REVISION = 4
 """Part of every hash; raised when code changes what the same settings give."""
 STAGES = ("objects", "grasps", "scenes", "views", "labels")
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -51,11 +46,13 @@ def ensure(
     config: Mapping[str, Any],
     hand: Mapping[str, Any],
     representation: Mapping[str, Any] | None = None,
+    share: Share | None = None,
 ) -> Dataset:
     """Return the dataset of these configs (groups `dataset`, `hand`, `repr`), making what is missing.
 
-    Labels are made only with a representation. Progress is shown, and each stage is locked while it is made, so that
-    of several runs one makes it and the others wait. Raises DexgraspError for bad settings and damaged stores.
+    Labels are made only with a representation. Progress is shown. Of several runs one makes a stage and the others
+    wait, unless they have a `share` of several parts: those make it together. Raises DexgraspError for bad settings
+    and damaged stores.
     """
     settings, hand = _plain(config), _plain(hand)
     told = None if representation is None else _plain(representation)
@@ -63,13 +60,17 @@ def ensure(
     root = Path(settings["root"]).expanduser().absolute()
     folders: dict[str, Path] = {}
     parent = ""
-    for stage in STAGES if told else STAGES[:-1]:
-        content = _content(stage, settings, identity, told) | {"after": parent, "revision": REVISION}
-        parent = digest(content)
-        folder = root / f"{stage}-{parent}"
-        dataset = Dataset(settings, hand, folders, told)
-        _run(folder, stage, content, *_work(stage, dataset), settings)
-        folders[stage] = folder
+    with ExitStack() as stack:
+        # Workers are started when there is something to make, once for all stages.
+        chosen = settings["backend"], settings["workers"], settings.get("address")
+        start = cache(lambda: stack.enter_context(workers.pool(*chosen)))
+        for stage in STAGES if told else STAGES[:-1]:
+            content = _content(stage, settings, identity, told) | {"after": parent, "revision": REVISION}
+            parent = digest(content)
+            folder = root / f"{stage}-{parent}"
+            work = _work(stage, content, Dataset(settings, hand, folders, told))
+            make_store(folder, work, settings["seed"], start, share or Share())
+            folders[stage] = folder
     return Dataset(settings, hand, folders, told)
 
 
@@ -94,6 +95,7 @@ def table(rows: Sequence[Made]) -> str:
 
 def _check(settings: dict[str, Any], hand: dict[str, Any], told: dict[str, Any] | None) -> Hand:
     """Find what is wrong before anything is written; return the hand."""
+    workers.check(settings["backend"], settings.get("address"), settings["workers"])
     stages.Settings.read(settings)
     built = build_hand(hand)
     if told is not None:
@@ -142,19 +144,19 @@ def _listing(objects: dict[str, Any]) -> list[Any]:
     return [[str(path.relative_to(folder)), path.stat().st_size] for path in files]
 
 
-def _work(stage: str, dataset: Dataset) -> tuple[Callable[[], Sequence[Any]], Callable[..., Item]]:
-    """Return what a stage is made of, when asked for, and what makes one item of it."""
+def _work(name: str, content: Mapping[str, Any], dataset: Dataset) -> Stage:
+    """Return what a stage is made of, and what makes one item of it."""
     config = dataset.config
-    if stage == "objects":
-        return lambda: _objects(config), stages.make_object
-    if stage == "grasps":
-        return lambda: range(len(dataset.store("objects"))), partial(stages.make_grasps, dataset)
-    if stage == "scenes":
-        return lambda: range(config["scenes"]["count"]), partial(stages.make_scene, dataset)
-    if stage == "views":
+    if name == "objects":
+        return Stage(name, content, lambda: _objects(config), stages.make_object, whole=True)
+    if name == "grasps":
+        return Stage(name, content, lambda: range(len(dataset.store("objects"))), partial(stages.make_grasps, dataset))
+    if name == "scenes":
+        return Stage(name, content, lambda: range(config["scenes"]["count"]), partial(stages.make_scene, dataset))
+    if name == "views":
         number = config["scenes"]["count"] * config["views"]["per_scene"]
-        return lambda: range(number), partial(stages.make_view, dataset)
-    return lambda: range(len(dataset)), partial(stages.make_labels, dataset)
+        return Stage(name, content, lambda: range(number), partial(stages.make_view, dataset))
+    return Stage(name, content, lambda: range(len(dataset)), partial(stages.make_labels, dataset))
 
 
 def _objects(config: Mapping[str, Any]) -> list[tuple[int, Any]]:
@@ -163,60 +165,6 @@ def _objects(config: Mapping[str, Any]) -> list[tuple[int, Any]]:
         remedy = "check objects.path, or take conf/objects/procedural.yaml"
         raise DexgraspError(f"objects in {config['objects']}", "none that can be used", remedy)
     return list(enumerate(found))
-
-
-def _run(
-    folder: Path,
-    stage: str,
-    content: Mapping[str, Any],
-    inputs: Callable[[], Sequence[Any]],
-    make: Callable[..., Item],
-    settings: Mapping[str, Any],
-) -> None:
-    if _finished(folder):
-        return
-    work = inputs()
-    with lock(folder):
-        if _finished(folder):
-            return
-        # Small enough to keep every worker busy, large enough not to litter; the same for any number of workers.
-        per_shard = min(max(math.ceil(len(work) / 32), 1), 16)
-        count = math.ceil(len(work) / per_shard)
-        store = Store.create(folder, stage, content, settings["seed"], count)
-        log.info("making %s in %s: %d of %d shards are missing", stage, folder, len(store.missing), count)
-        began = time.perf_counter()
-        workers = settings["workers"] or joblib.cpu_count()
-        parallel = joblib.Parallel(
-            n_jobs=workers, backend=settings["backend"], return_as="generator_unordered", initializer=end_with_parent
-        )
-        pieces = {i: work[i * per_shard : (i + 1) * per_shard] for i in store.missing}
-        tasks = (joblib.delayed(_shard)(folder, i, make, piece) for i, piece in pieces.items())
-        # Objects are few, large and already in memory.
-        results = parallel(tasks) if stage != "objects" else (_shard(folder, i, make, p) for i, p in pieces.items())
-        for _ in track(_added(store, results), stage, total=sum(map(len, pieces.values()))):
-            pass
-        store.annotate(seconds=store.manifest.get("seconds", 0.0) + time.perf_counter() - began)
-
-
-def _finished(folder: Path) -> bool:
-    return (folder / "manifest.json").exists() and Store.open(folder, complete=False).complete
-
-
-def _added(store: Store, results: Iterator[tuple[int, Shard]]) -> Iterator[None]:
-    for index, shard in results:
-        store.add(index, shard)
-        yield from (None for _ in shard.items)
-
-
-def _shard(folder: Path, index: int, make: Callable[..., Item], inputs: Sequence[Any]) -> tuple[int, Shard]:
-    """Make one shard; the worker's only entry."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # workers share the cores, and one thread gives the same bits everywhere
-    try:
-        items = (make(*value) if isinstance(value, tuple) else make(value) for value in inputs)
-        return index, write_shard(folder, index, items)
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _plain(config: Mapping[str, Any]) -> dict[str, Any]:

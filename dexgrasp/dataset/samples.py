@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dexgrasp.backbone import Backbone, Plan
-from dexgrasp.dataset.store import lock
+from dexgrasp.dataset.claims import lock
 from dexgrasp.errors import DexgraspError, room
 from dexgrasp.progress import track
 from dexgrasp.representation import Targets

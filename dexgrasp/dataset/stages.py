@@ -12,7 +12,7 @@ from dexgrasp.dataset.clutter import Approach, Clutter, build_scene, clear, feas
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.labels import LabelSettings, label
 from dexgrasp.dataset.sensor import Framing, Sensor, capture
-from dexgrasp.dataset.store import Item
+from dexgrasp.dataset.shard import Item
 from dexgrasp.dataset.synthesis import SynthesisSettings, synthesize
 from dexgrasp.dataset.truth import Truth, TruthSettings
 from dexgrasp.errors import DexgraspError

@@ -1,54 +1,30 @@
 """Immutable tar shards of safetensors under one JSON manifest.
 
 A shard is a plain tar of `<key>.safetensors` and `<key>.json` members, so that WebDataset reads it as it stands. It
-is written beside its place, synced and renamed: a file under its final name is whole, whatever interrupted the
-writer. The manifest holds configuration, seed, sha256 and the offsets of every item, hence random access without
-scanning; it is rewritten (again by rename) each time a shard is added.
+is written beside its place, synced and renamed, and so is its record after it: what lies under its final name is
+whole, whatever interrupted the writer, and no two processes ever write one file. When all shards are there, their
+records (sha256 and the offsets of every item, hence random access without scanning) go into the manifest beside
+configuration and seed.
 """
 
-import fcntl
 import hashlib
-import io
 import json
 import logging
 import os
-import socket
-import tarfile
-import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import safetensors.torch
-from torch import Tensor
 
-from dexgrasp.errors import DexgraspError, room
+from dexgrasp.dataset.claims import lock
+from dexgrasp.dataset.shard import Item, Shard, shard_name, write_shard, write_whole
+from dexgrasp.errors import DexgraspError
 
-SCHEMA = 1
+SCHEMA = 2
 MANIFEST = "manifest.json"
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Item:
-    """One record: tensors by name, and plain JSON facts."""
-
-    key: str
-    tensors: Mapping[str, Tensor]
-    facts: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Shard:
-    """What the manifest knows of one file."""
-
-    file: str
-    sha256: str
-    bytes: int
-    items: tuple[tuple[str, int, int, int, int], ...]
-    """Key, then offset and size of its safetensors and of its JSON, in bytes."""
 
 
 def digest(config: Any) -> str:
@@ -57,45 +33,49 @@ def digest(config: Any) -> str:
 
 
 class Store:
-    """A folder of shards. Several processes may write different shards; only the holder of `lock` adds them."""
+    """A folder of shards. Any number of processes may write shards; each adds a file of its own."""
 
-    def __init__(self, folder: Path, manifest: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, manifest: dict[str, Any], records: Mapping[int, Shard] | None = None) -> None:
         self.folder = folder
         self.manifest = manifest
-        shards = manifest["shards"]
-        self._shards = {int(i): Shard(**{**s, "items": tuple(map(tuple, s["items"]))}) for i, s in shards.items()}
-        self._reindex()
+        self._shards = {int(i): Shard.read(record) for i, record in manifest["shards"].items()} | dict(records or {})
+        self._places: dict[str, tuple[int, tuple[str, int, int, int, int]]] | None = None
+        self._checked: set[int] = set()
 
     @classmethod
-    def create(cls, folder: Path, kind: str, config: Mapping[str, Any], seed: int, shards: int) -> "Store":
+    def create(
+        cls, folder: Path, kind: str, config: Mapping[str, Any], seed: int, shards: int, alone: bool = True
+    ) -> "Store":
         """Start a store, or take up one of the same configuration where it was left.
 
-        Shards that the manifest lists but that are gone are forgotten, so that they are made again.
+        Shards that are recorded but gone are forgotten, so that they are made again. Unless `alone`, other processes
+        may be writing into it now.
         """
         folder.mkdir(parents=True, exist_ok=True)
-        for stale in folder.glob(".*.tmp"):
+        for stale in folder.glob(".*.tmp") if alone else ():
             stale.unlink(missing_ok=True)
         identity = {"schema": SCHEMA, "kind": kind, "hash": digest(config), "seed": seed, "expected_shards": shards}
-        if (folder / MANIFEST).exists():
-            store = cls.open(folder, complete=False)
-            for key, value in identity.items():
-                if store.manifest.get(key) != value:
-                    raise DexgraspError(
-                        f"a store with {key} {value!r} in {folder}",
-                        f"one with {key} {store.manifest.get(key)!r}",
-                        "choose another folder, or delete this one",
-                    )
-            store._shards = {i: s for i, s in store._shards.items() if (folder / s.file).exists()}
-            store._reindex()
-            return store
-        store = cls(folder, identity | {"config": dict(config), "shards": {}})
-        store._save()
+        with lock(folder / MANIFEST):
+            if not (folder / MANIFEST).exists():
+                store = cls(folder, identity | {"config": dict(config), "shards": {}})
+                store._save()
+        store = cls.open(folder, complete=False)
+        for key, value in identity.items():
+            if store.manifest.get(key) != value:
+                raise DexgraspError(
+                    f"a store with {key} {value!r} in {folder}",
+                    f"one with {key} {store.manifest.get(key)!r}",
+                    "choose another folder, or delete this one",
+                )
+        store._shards = {i: s for i, s in store._shards.items() if (folder / s.file).exists()}
+        store._places = None
         return store
 
     @classmethod
     def open(cls, folder: Path, complete: bool = True) -> "Store":
         """Open for reading; `complete` asks for every shard to be there (contents are checked when first read)."""
         path = folder / MANIFEST
+        records = _records(folder)  # before the manifest, which takes them in and only then are they removed
         try:
             manifest = json.loads(path.read_text())
             schema = manifest["schema"]
@@ -109,7 +89,7 @@ class Store:
         if schema != SCHEMA:
             remedy = "make the data again with this version of dexgrasp, or read it with the version that wrote it"
             raise DexgraspError(f"schema {SCHEMA} in {path}", f"schema {schema}", remedy)
-        store = cls(folder, manifest)
+        store = cls(folder, manifest, records)
         for shard in store._shards.values():
             file = folder / shard.file
             if file.exists() and file.stat().st_size != shard.bytes:
@@ -136,15 +116,24 @@ class Store:
         return write_shard(self.folder, index, items)
 
     def add(self, index: int, shard: Shard) -> None:
-        """Enter a written shard into the manifest."""
+        """Take note of a shard that has been written since this store was opened."""
         self._shards[index] = shard
-        self._reindex()
-        self._save()
+        self._places = None
 
-    def annotate(self, **facts: Any) -> None:
-        """Enter facts about the whole store into the manifest, beside its own keys."""
-        self.manifest |= facts
-        self._save()
+    def finish(self, seconds: float = 0.0) -> None:
+        """Take all records into the manifest and remove what making has left; whoever comes second changes nothing.
+
+        `seconds`, wall time that this run has worked on it, is added up.
+        """
+        with lock(self.folder / MANIFEST):
+            whole = Store.open(self.folder)
+            self.manifest, self._shards = whole.manifest, whole._shards
+            self._places = None
+            self.manifest["seconds"] = self.manifest.get("seconds", 0.0) + seconds
+            self._save()
+            for pattern in ("shard-*.json", ".*.tmp", ".*.claim"):
+                for path in self.folder.glob(pattern):
+                    path.unlink(missing_ok=True)
 
     def __len__(self) -> int:
         return len(self._index)
@@ -159,8 +148,9 @@ class Store:
 
     def __getitem__(self, key: int | str) -> Item:
         """Read one item by position or key; the first read from a shard checks the whole shard."""
+        index = self._index
         name = self._keys[key] if isinstance(key, int) else key
-        number, (_, start, size, facts_start, facts_size) = self._index[name]
+        number, (_, start, size, facts_start, facts_size) = index[name]
         shard = self._shards[number]
         if number not in self._checked:
             self._check(shard)
@@ -196,79 +186,36 @@ class Store:
             expected = f"sha256 {shard.sha256} ({shard.bytes} bytes) for shard {path}"
             raise DexgraspError(expected, f"sha256 {found} ({size} bytes): truncated or damaged", remedy)
 
-    def _reindex(self) -> None:
-        self._index = {item[0]: (i, item) for i, shard in sorted(self._shards.items()) for item in shard.items}
-        self._keys = list(self._index)
-        self._checked: set[int] = set()
+    @property
+    def _index(self) -> dict[str, tuple[int, tuple[str, int, int, int, int]]]:
+        if self._places is None:
+            self._places = {item[0]: (i, item) for i, shard in sorted(self._shards.items()) for item in shard.items}
+            self._keys = list(self._places)
+        return self._places
 
     def _save(self) -> None:
         self.manifest["shards"] = {str(i): asdict(shard) for i, shard in sorted(self._shards.items())}
         self.manifest["count"] = len(self._index)
-        _write_whole(self.folder / MANIFEST, json.dumps(self.manifest, indent=1, default=str).encode())
+        write_whole(self.folder / MANIFEST, json.dumps(self.manifest, indent=1, default=str).encode())
 
 
-def write_shard(folder: Path, index: int, items: Iterable[Item]) -> Shard:
-    """Write `shard-<index>.tar` into `folder` whole or not at all; the same items give the same bytes."""
-    buffer, entries = io.BytesIO(), []
-    with tarfile.open(fileobj=buffer, mode="w", format=tarfile.USTAR_FORMAT) as tar:
-        for item in items:
-            if not item.key or "." in item.key or "/" in item.key:
-                raise ValueError(f"key {item.key!r}: a tar of samples needs keys without dots and slashes")
-            tensors = {name: value.contiguous() for name, value in item.tensors.items()}
-            whole = _append(tar, f"{item.key}.safetensors", safetensors.torch.save(tensors))
-            entries.append((item.key, *whole, *_append(tar, f"{item.key}.json", json.dumps(item.facts).encode())))
-    content = buffer.getbuffer()
-    name = f"shard-{index:05d}.tar"
-    _write_whole(folder / name, content)
-    return Shard(name, hashlib.sha256(content).hexdigest(), len(content), tuple(entries))
+def recorded(folder: Path, index: int) -> Shard | None:
+    """Return shard `index` of the store in `folder` where any process has made it by now."""
+    shard = _record(folder / f"{shard_name(index).removesuffix('.tar')}.json")
+    if shard is None:
+        here = json.loads((folder / MANIFEST).read_text())["shards"].get(str(index))
+        shard = None if here is None else Shard.read(here)
+    return shard if shard is not None and (folder / shard.file).exists() else None
 
 
-def _append(tar: tarfile.TarFile, name: str, content: bytes) -> tuple[int, int]:
-    member = tarfile.TarInfo(name)
-    member.size = len(content)
-    tar.addfile(member, io.BytesIO(content))
-    return tar.offset - (len(content) + 511) // 512 * 512, len(content)
+def _records(folder: Path) -> dict[int, Shard]:
+    """Return what has been recorded of shards that the manifest does not hold yet."""
+    found = ((path, _record(path)) for path in sorted(folder.glob("shard-*.json")))
+    return {int(path.stem.removeprefix("shard-")): shard for path, shard in found if shard is not None}
 
 
-def _write_whole(path: Path, content: bytes | memoryview) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+def _record(path: Path) -> Shard | None:
     try:
-        with room(f"{len(content)} bytes", path.parent):
-            with open(temporary, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)  # the new name itself must survive a power cut
-    finally:
-        os.close(folder)
-
-
-@contextmanager
-def lock(folder: Path) -> Iterator[None]:
-    """Hold the right to make `folder`; others wait, and say for whom.
-
-    The kernel drops the lock with its holder, however that ends, so a lock cannot go stale; the name in the file
-    is for people only.
-    """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    path = folder.with_name(f".{folder.name}.lock")
-    with open(path, "a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            log.info("waiting for %s, which is being made by %s", folder, file.read().strip() or "another run")
-            started = time.monotonic()
-            fcntl.flock(file, fcntl.LOCK_EX)
-            log.info("waited %.0f s for %s", time.monotonic() - started, folder)
-        file.seek(0)
-        file.truncate()
-        file.write(f"process {os.getpid()} on {socket.gethostname()}")
-        file.flush()
-        yield
+        return Shard.read(json.loads(path.read_text()))
+    except FileNotFoundError:
+        return None
