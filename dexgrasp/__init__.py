@@ -8,17 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dexgrasp import quality
+    from dexgrasp.dataset.dataset import open_dataset
     from dexgrasp.model import load_model
     from dexgrasp.plugins import load_backbone, load_hand, load_representation
 
 __version__ = "0.1.0"
-__all__ = ["load_backbone", "load_hand", "load_model", "load_representation", "quality"]
+__all__ = ["load_backbone", "load_hand", "load_model", "load_representation", "open_dataset", "quality"]
 
 _HOMES = {
     "load_hand": "dexgrasp.plugins",
     "load_representation": "dexgrasp.plugins",
     "load_backbone": "dexgrasp.plugins",
     "load_model": "dexgrasp.model",
+    "open_dataset": "dexgrasp.dataset.dataset",
 }
 
 

@@ -4,7 +4,7 @@ import fnmatch
 import json
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import joblib
@@ -15,6 +15,7 @@ from dexgrasp.child import end_with_parent
 from dexgrasp.convex import convex_parts
 from dexgrasp.errors import DexgraspError
 from dexgrasp.objects import Object
+from dexgrasp.origins import origins
 from dexgrasp.repair import joined, manifold, repaired
 
 log = logging.getLogger(__name__)
@@ -61,7 +62,8 @@ def load_folder(
     `layout` is one of `LAYOUTS`, flat or auto; `scale` turns file units into metres (default 1; ShapeNet, whose
     meshes have no unit, needs one); `include` and `exclude` are glob patterns of names; `repair` closes meshes that
     are not watertight and reports by how much the surface moved; `threshold` as in `convex_parts`; `workers`
-    processes share the work. Frames are the files'. Raises DexgraspError where nothing usable is found.
+    processes share the work. Frames are the files'. Source and licence are those of a ``manifest.json`` (`origins`).
+    Raises DexgraspError where nothing usable is found.
     """
     root = Path(path).expanduser()
     entries = find_meshes(root, layout, scale)
@@ -72,7 +74,12 @@ def load_folder(
     results: list[tuple[str, Object | None, str]] = list(
         joblib.Parallel(n_jobs=workers, initializer=end_with_parent)(jobs)
     )
-    objects = [item for _, item, _ in results if item is not None]
+    known = origins(root)
+    objects = []
+    for entry, (_, item, _) in zip(entries, results, strict=False):
+        if item is not None:
+            source, licence = known.get(entry.files[0].resolve(), ("", ""))
+            objects.append(replace(item, source=source or item.source, licence=licence))
     skipped = [(name, note) for name, item, note in results if item is None]
     for name, item, note in results:
         if note:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import torch
@@ -15,13 +15,17 @@ from torch import Tensor
 
 from dexgrasp.errors import DexgraspError
 from dexgrasp.seeds import stream
-from dexgrasp.shapes import FAMILIES, HELD_OUT, Family
-from dexgrasp.shapes.solid import Solid
 from dexgrasp.stable import stable_poses
+
+if TYPE_CHECKING:
+    from dexgrasp.shapes import Family
+    from dexgrasp.shapes.solid import Solid
 
 Array = NDArray[np.float64]
 
 SPLITS = ("train", "test", "all")
+OWN_LICENCE = "Apache-2.0"
+"""Of the procedural shapes."""
 FIRST_TEST_NUMBER = 500
 """Shapes of the test split are numbered from here, so that no draw is in both splits."""
 
@@ -38,6 +42,8 @@ class Object:
     """Convex bodies that together cover the mesh, for physics, m."""
     source: str = ""
     """Where it comes from: a path, or how it was drawn."""
+    licence: str = ""
+    """Under which its mesh may be used; empty where nobody says."""
 
     @cached_property
     def com(self) -> Array:
@@ -63,14 +69,13 @@ class Object:
         # Arrays travel, trimesh's caches do not.
         known = {key: self.__dict__[key] for key in ("com", "volume", "radius", "stable") if key in self.__dict__}
         bodies = tuple((np.asarray(body.vertices), np.asarray(body.faces)) for body in (self.mesh, *self.parts))
-        return _rebuild, (self.name, self.family, bodies, self.source, known)
+        return _rebuild, ((self.name, self.family, self.source, self.licence), bodies, known)
 
 
-def _rebuild(
-    name: str, family: str, bodies: Sequence[tuple[Array, NDArray[Any]]], source: str, known: Mapping[str, Any]
-) -> Object:
+def _rebuild(texts: Sequence[str], bodies: Sequence[tuple[Array, NDArray[Any]]], known: Mapping[str, Any]) -> Object:
     mesh, *parts = (trimesh.Trimesh(vertices, faces, process=False) for vertices, faces in bodies)
-    made = Object(name, family, mesh, tuple(parts), source)
+    name, family, source, licence = texts
+    made = Object(name, family, mesh, tuple(parts), source, licence)
     made.__dict__.update(known)
     return made
 
@@ -154,6 +159,8 @@ def procedural(
     A shape follows from the seed, its family and its number alone. The test split holds other draws of every
     training family, and families that training never sees. `size` and `stretch` as in `shape`.
     """
+    from dexgrasp.shapes import FAMILIES, HELD_OUT  # reading objects needs no solid modeller
+
     if split not in SPLITS:
         raise DexgraspError(f"objects.split to be one of {SPLITS}", repr(split), "set objects.split")
     if split == "all":
@@ -176,6 +183,8 @@ def shape(
     Its natural size is multiplied by a factor drawn from the range `size`, and each axis by one drawn from
     1 / stretch .. stretch (both uniform in the logarithm).
     """
+    from dexgrasp.shapes import FAMILIES, HELD_OUT
+
     makers: dict[str, Family] = FAMILIES | HELD_OUT
     if family not in makers:
         raise DexgraspError("a shape family", repr(family), f"take one of {sorted(makers)}")
@@ -193,19 +202,19 @@ def shape(
     return _object(solid, f"{family}_{number:03d}", family, f"procedural seed={seed}")
 
 
-def _object(solid: Solid, name: str, family: str, source: str) -> Object:
+def _object(solid: "Solid", name: str, family: str, source: str) -> Object:
     surface = solid.body.to_mesh64()
     vertices, faces = np.asarray(surface.vert_properties)[:, :3], np.asarray(surface.tri_verts).astype(np.int64)
     centre = trimesh.Trimesh(vertices, faces, process=False).center_mass
     mesh = trimesh.Trimesh(vertices - centre, faces, process=False)
     parts = tuple(trimesh.convex.convex_hull(part - centre) for part in solid.parts)
-    return Object(name, family, mesh, parts, source)
+    return Object(name, family, mesh, parts, source, OWN_LICENCE)
 
 
 def object_to_tensors(item: Object) -> dict[str, Tensor]:
     """Return everything of an object as tensors (float64, int64; texts as UTF-8 bytes), for a store."""
     poses, probabilities = item.stable
-    texts = json.dumps([item.name, item.family, item.source]).encode()
+    texts = json.dumps([item.name, item.family, item.source, item.licence]).encode()
     part_offsets = np.cumsum([[0, 0], *((len(part.vertices), len(part.faces)) for part in item.parts)], axis=0)
     arrays = {
         "vertices": item.mesh.vertices,
@@ -225,13 +234,11 @@ def object_to_tensors(item: Object) -> dict[str, Tensor]:
 def object_from_tensors(tensors: Mapping[str, Tensor]) -> Object:
     """Rebuild the object of `object_to_tensors`, bit by bit."""
     arrays = {key: value.numpy() for key, value in tensors.items()}
-    name, family, source = json.loads(arrays["texts"].tobytes())
     offsets = arrays["part_offsets"]
     bodies = [(arrays["vertices"], arrays["faces"])]
     for (v0, f0), (v1, f1) in pairwise(offsets):
         bodies.append((arrays["part_vertices"][v0:v1], arrays["part_faces"][f0:f1]))
     volume, radius = map(float, arrays["size"])
     stable = (arrays["stable_poses"], arrays["stable_probabilities"])
-    return _rebuild(
-        name, family, bodies, source, {"com": arrays["com"], "volume": volume, "radius": radius, "stable": stable}
-    )
+    known = {"com": arrays["com"], "volume": volume, "radius": radius, "stable": stable}
+    return _rebuild(json.loads(arrays["texts"].tobytes()), bodies, known)

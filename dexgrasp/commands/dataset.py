@@ -36,6 +36,7 @@ def main(config: DictConfig) -> None:
     print(pipeline.table(rows))
     run = Path(HydraConfig.get().runtime.output_dir)
     stages = [{**vars(row), "folder": str(row.folder)} for row in rows]
+    dataset.save(run / "dataset.json")
     (run / "results.json").write_text(json.dumps({"schema": SCHEMA, "command": "dataset", "stages": stages}, indent=1))
     print(run)
 

@@ -1,30 +1,41 @@
-"""A made dataset, read lazily: objects, their grasps, scenes, views, labels."""
+"""A made dataset, read lazily: objects, their grasps, scenes, views, labels.
+
+Reading needs torch, trimesh and safetensors alone: neither a simulator nor a ray tracer nor a GPU. What computes with
+the hand or with distances (`hand`, `shape`, `closer`, `field`, `body`) imports its own when it is asked for.
+"""
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from dexgrasp.closing import Closer
-from dexgrasp.collision import HandShape
-from dexgrasp.dataset.labels import Labels
+from dexgrasp.dataset.kept import Kept
+from dexgrasp.dataset.shard import write_whole
 from dexgrasp.dataset.store import Store
-from dexgrasp.dataset.truth import Body
-from dexgrasp.distance import DistanceField
+from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
-from dexgrasp.hand import Hand
 from dexgrasp.objects import ObjectSet, object_from_tensors
-from dexgrasp.plugins import build_hand
 from dexgrasp.scene import Scene, View
 
-KEPT = 256
-"""Objects whose fields and grasps are kept in memory by each process."""
+if TYPE_CHECKING:
+    from dexgrasp.closing import Closer
+    from dexgrasp.collision import HandShape
+    from dexgrasp.dataset.labels import Labels
+    from dexgrasp.dataset.truth import Body
+    from dexgrasp.distance import DistanceField
+    from dexgrasp.hand import Hand
+
+KEPT_FIELDS, KEPT_GRASPS = 600_000_000, 400_000_000
+"""Bytes of distance fields and of grasps that each process keeps in memory."""
+SCHEMA = 1
+"""Of a description: {schema, config, hand, representation, stages: {stage: folder, relative to the file's}}."""
 
 
 class Dataset:
@@ -46,31 +57,67 @@ class Dataset:
     ) -> None:
         self.config, self.hand_config, self.representation = config, hand, representation
         self.folders = {stage: Path(folder) for stage, folder in folders.items()}
-        self.field = lru_cache(KEPT)(self._field)
-        self.grasps = lru_cache(KEPT)(self._grasps)
+        self.field = Kept(self._field, KEPT_FIELDS)
+        self.grasps = Kept(self._grasps, KEPT_GRASPS)
 
     def __reduce__(self) -> tuple[Any, tuple[str]]:
         parts = [self.config, self.hand_config, {k: str(v) for k, v in self.folders.items()}, self.representation]
         return _opened, (json.dumps(parts),)
 
+    @classmethod
+    def open(cls, path: str | Path) -> "Dataset":
+        """Open a dataset by its description, or by a folder: a run's, one of its stages', or the root of all stages.
+
+        Raises DexgraspError where there is none, and where a root holds several.
+        """
+        file = _description(Path(path).expanduser().absolute())
+        try:
+            content = json.loads(file.read_text())
+            schema = content["schema"]
+        except (ValueError, KeyError, TypeError) as cause:
+            raise DexgraspError(f"a description of a dataset in {file}", str(cause), "make it again") from cause
+        if schema != SCHEMA:
+            raise DexgraspError(f"schema {SCHEMA} in {file}", f"schema {schema}", "make it again with this version")
+        folders = {stage: Path(os.path.normpath(file.parent / name)) for stage, name in content["stages"].items()}
+        return cls(content["config"], content["hand"], folders, content["representation"])
+
+    def save(self, path: Path) -> Path:
+        """Write the description by which `open` finds the stages, and return its path."""
+        stages = {stage: os.path.relpath(folder, path.parent) for stage, folder in self.folders.items()}
+        content = {"schema": SCHEMA, "config": self.config, "hand": self.hand_config}
+        content |= {"representation": self.representation, "stages": stages}
+        write_whole(path, json.dumps(content, indent=1).encode())
+        return path
+
     @lru_cache(8)  # noqa: B019  datasets live as long as the process
     def store(self, stage: str) -> Store:
         """Return the store of a stage."""
+        if stage not in self.folders:
+            raise DexgraspError(f"a dataset with {stage}", f"one with {', '.join(self.folders)}", f"make its {stage}")
         return Store.open(self.folders[stage])
 
     @cached_property
-    def hand(self) -> Hand:
-        """The hand that grasps."""
-        return build_hand(self.hand_config)
+    def hand(self) -> "Hand":
+        """The hand that grasps; where its URDF is not where it was, the installed hand of that name."""
+        from dexgrasp.plugins import build_hand, load_hand
+
+        options = dict(self.hand_config)
+        if "urdf" in options and not Path(options["urdf"]).expanduser().exists():
+            return load_hand(str(options.pop("name")), **{k: v for k, v in options.items() if k != "urdf"})
+        return build_hand(options)
 
     @cached_property
-    def shape(self) -> HandShape:
+    def shape(self) -> "HandShape":
         """The hand's body, for collisions."""
+        from dexgrasp.collision import HandShape
+
         return HandShape(self.hand)
 
     @cached_property
-    def closer(self) -> Closer:
+    def closer(self) -> "Closer":
         """Closes the hand."""
+        from dexgrasp.closing import Closer
+
         return Closer(self.hand)
 
     @cached_property
@@ -79,11 +126,15 @@ class Dataset:
         items = tuple(object_from_tensors(item.tensors) for item in self.store("objects"))
         return ObjectSet(self.store("objects").manifest["config"]["objects"].get("path", self.config["name"]), items)
 
-    def _field(self, index: int) -> DistanceField:
+    def _field(self, index: int) -> "DistanceField":
+        from dexgrasp.distance import DistanceField
+
         return DistanceField.build(self.objects[index].mesh)
 
-    def body(self, index: int) -> Body:
+    def body(self, index: int) -> "Body":
         """Return object `index` as the closing hand meets it."""
+        from dexgrasp.dataset.truth import Body
+
         item = self.objects[index]
         return Body(self.field(index), item.com, item.radius)
 
@@ -132,8 +183,10 @@ class Dataset:
         camera_T_world = inverse(self.store("views")[index].tensors["world_T_camera"].double())
         return self.scene_grasps(self.scene_of(index)).moved(camera_T_world)
 
-    def labels(self, view: int) -> Labels:
+    def labels(self, view: int) -> "Labels":
         """Return the labels of view `view` in the representation with which the dataset was made."""
+        from dexgrasp.dataset.labels import Labels
+
         return Labels(**self.store("labels")[view].tensors)
 
     def split(self, name: str) -> Sequence[int]:
@@ -146,3 +199,25 @@ class Dataset:
 @lru_cache(4)
 def _opened(text: str) -> Dataset:
     return Dataset(*json.loads(text))
+
+
+def open_dataset(path: str | Path) -> Dataset:
+    """Open a dataset that `python -m dexgrasp dataset` has made, by any path that leads to it, see `Dataset.open`."""
+    return Dataset.open(path)
+
+
+def _description(path: Path) -> Path:
+    """Return the description that a path means."""
+    if path.is_file():
+        return path
+    if (path / "dataset.json").is_file():
+        return path / "dataset.json"
+    root = path.parent if (path / "manifest.json").is_file() else path
+    found = {file: set(json.loads(file.read_text()).get("stages", {}).values()) for file in root.glob("dataset-*.json")}
+    if root != path:
+        found = {file: stages for file, stages in found.items() if path.name in stages}
+    whole = [file for file, stages in found.items() if not any(stages < other for other in found.values())]
+    if len(whole) != 1:
+        listed = ", ".join(sorted(file.name for file in whole)) or "none"
+        raise DexgraspError(f"one dataset in {path}", listed, "give the path of one (`dataset` prints it)")
+    return whole[0]

@@ -71,7 +71,9 @@ def ensure(
             work = _work(stage, content, Dataset(settings, hand, folders, told))
             make_store(folder, work, settings["seed"], start, share or Share())
             folders[stage] = folder
-    return Dataset(settings, hand, folders, told)
+    dataset = Dataset(settings, hand, folders, told)
+    dataset.save(root / f"dataset-{parent}.json")
+    return dataset
 
 
 def summary(dataset: Dataset) -> list[Made]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -33,12 +34,13 @@ def key(index: int) -> str:
 
 def make_object(index: int, item: Object) -> Item:
     """Keep an object with its stable poses."""
-    return Item(key(index), object_to_tensors(item), {"name": item.name, "family": item.family})
+    facts = {"name": item.name, "family": item.family, "source": item.source, "licence": item.licence}
+    return Item(key(index), object_to_tensors(item), facts)
 
 
 def make_grasps(dataset: Dataset, index: int) -> Item:
     """Synthesise the grasps of object `index`."""
-    settings, item = Settings.read(dataset.config), dataset.objects[index]
+    settings, item = settings_of(dataset), dataset.objects[index]
     grasps, summary = synthesize(dataset.hand, item, settings.synthesis, dataset.config["seed"])
     facts = {"name": item.name, "kept": len(grasps), "summary": vars(summary)}
     return Item(key(index), grasps.to(torch.float32).tensors(), facts)
@@ -47,7 +49,7 @@ def make_grasps(dataset: Dataset, index: int) -> Item:
 def make_scene(dataset: Dataset, index: int) -> Item:
     """Lay out scene `index` and find, among some grasps of each object, those that are free of all others."""
     config, objects = dataset.config, dataset.objects
-    settings = Settings.read(config)
+    settings = settings_of(dataset)
     simulator = MujocoSimulator(config["simulator"]["settling"])
     scene = build_scene(objects, settings.clutter, simulator, config["seed"], index)
     numbers = [objects.names.index(name) for name in scene.objects]
@@ -73,7 +75,7 @@ def make_scene(dataset: Dataset, index: int) -> Item:
 
 def make_view(dataset: Dataset, index: int) -> Item:
     """Look at a scene from a random viewpoint."""
-    settings = Settings.read(dataset.config)
+    settings = settings_of(dataset)
     number = dataset.scene_of(index)
     scene = dataset.scene(number)
     generator = stream(dataset.config["seed"], "view", index)
@@ -93,7 +95,7 @@ def make_view(dataset: Dataset, index: int) -> Item:
 def make_labels(dataset: Dataset, index: int) -> Item:
     """Tell the grasps of a view in the dataset's representation and the level frame, keeping what is true."""
     assert dataset.representation is not None
-    settings = Settings.read(dataset.config)
+    settings = settings_of(dataset)
     view, number = levelled(dataset.view(index)), dataset.scene_of(index)
     world_T_level = view.world_T_camera.double()
     grasps = dataset.scene_grasps(number).moved(inverse(world_T_level))
@@ -106,7 +108,7 @@ def make_labels(dataset: Dataset, index: int) -> Item:
 
 def scene_truth(dataset: Dataset, index: int, world_T_frame: Tensor) -> Truth:
     """Return the checks of scene `index` for grasps in a frame, `object` counting the scene's objects."""
-    settings, scene = Settings.read(dataset.config), dataset.scene(index)
+    settings, scene = settings_of(dataset), dataset.scene(index)
     bodies = [dataset.body(i) for i in dataset.scene_objects(index).tolist()]
     obstacles = [body.field for body in bodies]
 
@@ -115,6 +117,12 @@ def scene_truth(dataset: Dataset, index: int, world_T_frame: Tensor) -> Truth:
         return clear(dataset.shape, dataset.hand, world, scene.poses, obstacles, settings.approach)
 
     return Truth(dataset.closer, bodies, inverse(world_T_frame) @ scene.poses, settings.truth, is_clear)
+
+
+@lru_cache(4)
+def settings_of(dataset: Dataset) -> "Settings":
+    """Return the settings of a dataset, read once in each process."""
+    return Settings.read(dataset.config)
 
 
 @dataclass(frozen=True)
