@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float
 from numba import njit
 from torch import Tensor
 
-from dexgrasp.distance import DistanceField, Field, lower_bound, seed_at
+from dexgrasp.distance import DistanceField, Field, lower_bound, quick_bound, seed_at
 from dexgrasp.hand import Hand
 from dexgrasp.hand_body import HandBody, carry, hand_body, place_links
 from dexgrasp.triangle_tree import nearest
@@ -21,6 +21,9 @@ class HandShape:
     def __init__(self, hand: Hand) -> None:
         self.hand = hand
         self.body: HandBody = hand_body(hand)
+        parts = [part for name in (record.name for record in hand.tree) for part in hand.collisions.get(name, ())]  # type: ignore[attr-defined]
+        self.corners = np.cumsum([0, *(len(part.vertices) for part in parts)])
+        """First of `body.vertices` of each convex part, and their number."""
         self._pairs: np.ndarray | None = None
 
     def object_distance(
@@ -144,22 +147,33 @@ def _approaches(
     retreat: float,
     limit: float,
 ) -> np.ndarray:
-    clear = np.ones(len(bases), np.bool_)
+    clear, every = np.ones(len(bases), np.bool_), np.ones(len(body.parents), np.bool_)
     full, poses = np.empty(len(body.offset)), np.empty((len(body.parents), 3, 4))
     for i in range(len(bases)):
         place_links(body, joints[i], bases[i], full, poses)
-        clear[i] = _approach(body, field, poses, bases[i, :, :3].copy() @ backward, retreat, limit)
+        direction = bases[i, :, :3].copy() @ backward
+        clear[i] = way_clear(body, field, poses, every, direction, retreat, limit)
     return clear
 
 
 @njit(cache=True)
-def _approach(
-    body: HandBody, field: Field, poses: np.ndarray, direction: np.ndarray, retreat: float, limit: float
+def way_clear(
+    body: HandBody,
+    field: Field,
+    poses: np.ndarray,
+    near: np.ndarray,
+    direction: np.ndarray,
+    retreat: float,
+    limit: float,
 ) -> bool:
+    """Return whether links at `poses` (object_T_link) overlap an object by at most `limit` (m) on their way.
+
+    The way is straight, `retreat` (m) along the unit vector `direction`. Only links that are `near` (L,) are tested.
+    """
     stack, since = np.empty(256, np.int64), np.empty(256)
     out = np.empty(7)
     for link in range(len(body.roots)):
-        if body.roots[link] < 0:
+        if body.roots[link] < 0 or not near[link]:
             continue
         stack[0], since[0] = body.roots[link], 0.0
         top = 1
@@ -171,7 +185,9 @@ def _approach(
             # A ball's distance cannot shrink faster than it travels.
             while way <= retreat:
                 u, v, w = x + way * direction[0], y + way * direction[1], z + way * direction[2]
-                gap = lower_bound(field, u, v, w) - radius
+                gap = quick_bound(field, u, v, w) - radius
+                if gap < 0.003:
+                    gap = lower_bound(field, u, v, w) - radius
                 if gap < 5e-4:
                     if body.children[node, 0] >= 0:
                         stack[top], stack[top + 1] = body.children[node, 0], body.children[node, 1]

@@ -148,6 +148,23 @@ def lower_bound(field: Field, x: float, y: float, z: float) -> float:
 
 
 @njit(cache=True)
+def quick_bound(field: Field, x: float, y: float, z: float) -> float:
+    """Return a lower bound of the signed distance at a point (m) from the one nearest grid node."""
+    h = field.spacing
+    u, v, w = (x - field.origin[0]) / h, (y - field.origin[1]) / h, (z - field.origin[2]) / h
+    nx, ny, nz = field.values.shape
+    if u < 0 or v < 0 or w < 0 or u > nx - 1 or v > ny - 1 or w > nz - 1:
+        box = field.tree.boxes[0]
+        dx = max(box[0] - x, x - box[3], 0.0)
+        dy = max(box[1] - y, y - box[4], 0.0)
+        dz = max(box[2] - z, z - box[5], 0.0)
+        return math.sqrt(dx * dx + dy * dy + dz * dz)
+    i, j, k = int(u + 0.5), int(v + 0.5), int(w + 0.5)
+    u, v, w = u - i, v - j, w - k
+    return field.values[i, j, k] - h * math.sqrt(u * u + v * v + w * w)
+
+
+@njit(cache=True)
 def seed_at(field: Field, x: float, y: float, z: float) -> int:
     """Return a triangle near a point."""
     h = field.spacing

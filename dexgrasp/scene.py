@@ -1,9 +1,28 @@
-"""A scene of objects on a table, and a camera's view of it."""
+"""A scene of objects on a table, with walls or without, and a camera's view of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """Solid boxes that stand fixed in the world, such as the walls of a bin. World frame, metres."""
+
+    poses: Float[Tensor, "K 4 4"]
+    """world_T_box, float64; the box's frame is in its middle."""
+    halves: Float[Tensor, "K 3"]
+    """Half the lengths of its sides, m, float64."""
+
+    def __len__(self) -> int:
+        return len(self.halves)
+
+
+def no_boxes() -> Boxes:
+    """Return what stands on an empty table."""
+    return Boxes(torch.zeros(0, 4, 4, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64))
 
 
 @dataclass(frozen=True)
@@ -15,6 +34,8 @@ class Scene:
     poses: Float[Tensor, "O 4 4"]
     """world_T_object, m."""
     seed: int
+    fixtures: Boxes = field(default_factory=no_boxes)
+    """What stands fixed beside the objects."""
 
     def __len__(self) -> int:
         return len(self.objects)

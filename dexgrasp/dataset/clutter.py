@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
+from dexgrasp.clearance import above_table, clear_way
 from dexgrasp.collision import HandShape
 from dexgrasp.distance import DistanceField
 from dexgrasp.execution import pregrasp
@@ -16,7 +17,7 @@ from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.objects import Object, ObjectSet
-from dexgrasp.scene import Scene
+from dexgrasp.scene import Boxes, Scene, no_boxes
 from dexgrasp.seeds import stream
 from dexgrasp.simulation.simulator import Simulator
 
@@ -136,23 +137,23 @@ def feasible(
     poses: Float[Tensor, "O 4 4"],
     fields: Sequence[DistanceField],
     approach: Approach,
+    fixtures: Boxes | None = None,
 ) -> Bool[Tensor, "N"]:
-    """Tell which grasps (world frame, `object` counts the rows of `poses`) are clear of table and neighbours.
+    """Tell which grasps (world frame, `object` counts the rows of `poses`) are clear of table, fixtures, neighbours.
 
     The closed hand at the grasp and the opened hand along the whole approach. `poses` is world_T_object; own object
     and self-collision are `approachable`'s matter, and synthesis has seen to them.
     """
-    ready, opened = pregrasp(hand, grasps, approach.retreat, approach.opening)
-    # Height is linear along a straight line without turning: the two ends suffice.
-    free = shape.table_distance(grasps.pose, grasps.joints) >= approach.table
-    for pose in (grasps.pose, ready):
+    _, opened = pregrasp(hand, grasps, approach.retreat, approach.opening)
+    free = torch.ones(len(grasps), dtype=torch.bool)
+    ends = ((opened, approach.retreat), (grasps.joints, 0.0))
+    for joints, way in ends:
         rows = free.nonzero().flatten()
-        free[rows] = shape.table_distance(pose[rows], opened[rows]) >= approach.table
-    for number, field in enumerate(fields):
-        object_T_base = inverse(poses[number].to(grasps.pose)) @ grasps.pose
-        for joints, way in ((grasps.joints, 0.0), (opened, approach.retreat)):
-            rows = (free & (grasps.object != number)).nonzero().flatten()
-            free[rows] = shape.approach_clear(field, object_T_base[rows], joints[rows], way, -approach.neighbour)
+        free[rows] = above_table(shape, grasps.pose[rows], joints[rows], way, approach.table)
+    for joints, way in ends:
+        rows = free.nonzero().flatten()
+        obstacles = grasps.object[rows], poses, fields, fixtures or no_boxes()
+        free[rows] = clear_way(shape, grasps.pose[rows], joints[rows], way, approach.neighbour, *obstacles)
     return free
 
 
@@ -163,9 +164,10 @@ def clear(
     poses: Float[Tensor, "O 4 4"],
     fields: Sequence[DistanceField],
     approach: Approach,
+    fixtures: Boxes | None = None,
 ) -> Bool[Tensor, "N"]:
     """Tell which grasps are `feasible` in the scene and `approachable` on their own object (world frame)."""
-    free = feasible(shape, hand, grasps, poses, fields, approach)
+    free = feasible(shape, hand, grasps, poses, fields, approach, fixtures)
     for number, field in enumerate(fields):
         rows = (free & (grasps.object == number)).nonzero().flatten()
         own = grasps[rows].moved(inverse(poses[number]))
