@@ -14,7 +14,8 @@ from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.labels import LabelSettings, label
 from dexgrasp.dataset.sensor import Framing, Sensor, capture
 from dexgrasp.dataset.shard import Item
-from dexgrasp.dataset.synthesis import SynthesisSettings, synthesize
+from dexgrasp.dataset.synthesis import synthesize
+from dexgrasp.dataset.synthesis_settings import SynthesisSettings
 from dexgrasp.dataset.truth import Truth, TruthSettings
 from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import inverse

@@ -1,0 +1,176 @@
+"""A quick look ahead: where would the fingertips touch if this hand closed?
+
+Each finger is only its fingertip circle, a ball here, that follows the closing motion through the distance grid. What
+the look promises is nearly what closing finds, at a twentieth of the time; what it rejects rarely closes.
+"""
+
+import math
+
+import numpy as np
+import torch
+from numba import njit
+
+from dexgrasp.distance import DistanceField, Field, seed_at
+from dexgrasp.hand import Hand
+from dexgrasp.hand_body import HandBody, carry, hand_body, place_link, place_links
+from dexgrasp.triangle_tree import nearest
+
+COARSENESS = 8.0
+"""The open hand is looked at with balls that follow it this much less closely than closing does."""
+NEAR = 5e-4
+"""A fingertip touches where the grid says that it is this near, m."""
+STEPS = 64
+"""Steps of a fingertip along its way, at most; those that slide along a surface are given up."""
+PROBES = 2048
+"""Postures from which the largest speed of a fingertip is told."""
+
+SEEN, BURIED, MISSED = range(3)
+"""How a look ended."""
+
+
+class Preview:
+    """Looks at hands that are to close on an object."""
+
+    def __init__(self, hand: Hand) -> None:
+        self.body = hand_body(hand, COARSENESS)
+        self.chains = _chains(self.body)
+        self.speeds = _tip_speeds(hand, self.body)
+
+    def look(
+        self, field: DistanceField, bases: np.ndarray, joints: np.ndarray, limit: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Look at hands object_T_base (N, 3, 4) with open fingers at joints (N, J).
+
+        Returns how each look ended (N,): SEEN, BURIED where the open hand is deeper than `limit` (m) in the object,
+        MISSED where some fingertip meets nothing; the full joints (N, M) where the fingertips meet the object; and
+        contact points and outward normals (N, F, 6) there, object frame (m).
+        """
+        return _look(self.body, field.field, bases, joints, self.chains, self.speeds, limit)
+
+
+def _chains(body: HandBody) -> np.ndarray:
+    """Return (F, L) the links that move when a finger closes, from base to fingertip; -1 where there are fewer."""
+    found = []
+    for finger, rate in enumerate(body.rates @ body.coupling.T):
+        link, way = int(body.tip_links[finger]), []
+        while link >= 0:
+            way.append(link)
+            link = int(body.parents[link])
+        way.reverse()
+        moving = [body.drives[link] >= 0 and rate[body.drives[link]] != 0 for link in way]
+        first = moving.index(True) if any(moving) else len(way)
+        found.append(way[first:])
+    width = max(map(len, found))
+    return np.array([way + [-1] * (width - len(way)) for way in found], dtype=np.int64)
+
+
+def _tip_speeds(hand: Hand, body: HandBody) -> np.ndarray:
+    """Return the largest speed (F,) of each fingertip's centre per unit of its closing parameter."""
+    generator = torch.Generator().manual_seed(0)
+    low, high = hand.limits.T
+    joints = low + (high - low) * torch.rand(PROBES, len(low), generator=generator, dtype=torch.float64)
+    here, step = hand.fingertips(joints)[..., :3, 3], 1e-5
+    speeds = []
+    for finger, rate in enumerate(torch.from_numpy(body.rates)):
+        there = hand.fingertips(joints + step * rate)[:, finger, :3, 3]
+        speeds.append(1.05 * float((there - here[:, finger]).norm(dim=1).max()) / step)
+    return np.array(speeds)
+
+
+@njit(cache=True)
+def interpolate(field: Field, x: float, y: float, z: float) -> float:
+    """Return about the signed distance at a point (m): trilinear in the grid, to its box outside."""
+    h = field.spacing
+    u, v, w = (x - field.origin[0]) / h, (y - field.origin[1]) / h, (z - field.origin[2]) / h
+    nx, ny, nz = field.values.shape
+    if u < 0 or v < 0 or w < 0 or u > nx - 1 or v > ny - 1 or w > nz - 1:
+        box = field.tree.boxes[0]
+        dx = max(box[0] - x, x - box[3], 0.0)
+        dy = max(box[1] - y, y - box[4], 0.0)
+        dz = max(box[2] - z, z - box[5], 0.0)
+        return math.sqrt(dx * dx + dy * dy + dz * dz)
+    i, j, k = min(int(u), nx - 2), min(int(v), ny - 2), min(int(w), nz - 2)
+    u, v, w = u - i, v - j, w - k
+    f = field.values
+    a = (f[i, j, k] * (1 - w) + f[i, j, k + 1] * w) * (1 - v) + (f[i, j + 1, k] * (1 - w) + f[i, j + 1, k + 1] * w) * v
+    i += 1
+    b = (f[i, j, k] * (1 - w) + f[i, j, k + 1] * w) * (1 - v) + (f[i, j + 1, k] * (1 - w) + f[i, j + 1, k + 1] * w) * v
+    return a * (1 - u) + b * u
+
+
+@njit(cache=True)
+def _buried(body: HandBody, field: Field, poses: np.ndarray, limit: float, stack: np.ndarray) -> bool:
+    for link in range(len(body.roots)):
+        if body.roots[link] < 0:
+            continue
+        stack[0] = body.roots[link]
+        top = 1
+        while top:
+            top -= 1
+            node = stack[top]
+            x, y, z = carry(poses, link, body.balls, node)
+            if interpolate(field, x, y, z) >= body.balls[node, 3] - limit:
+                continue
+            if body.children[node, 0] < 0:
+                return True
+            stack[top], stack[top + 1] = body.children[node, 0], body.children[node, 1]
+            top += 2
+    return False
+
+
+@njit(cache=True)
+def _look(
+    body: HandBody,
+    field: Field,
+    bases: np.ndarray,
+    joints: np.ndarray,
+    chains: np.ndarray,
+    speeds: np.ndarray,
+    limit: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    count, fingers, movable = len(bases), len(body.tip_links), len(body.offset)
+    status = np.zeros(count, np.int64)
+    closed, touches = np.empty((count, movable)), np.full((count, fingers, 6), np.nan)
+    start, full, rate = np.empty(movable), np.empty(movable), np.empty(movable)
+    poses = np.empty((len(body.parents), 3, 4))
+    stack, hit = np.empty(256, np.int64), np.empty(7)
+    for i in range(count):
+        place_links(body, joints[i], bases[i], start, poses)
+        closed[i] = start
+        if _buried(body, field, poses, limit, stack):
+            status[i] = BURIED
+            continue
+        for finger in range(fingers):
+            end = 0.0
+            for m in range(movable):
+                rate[m] = 0.0
+                for j in range(joints.shape[1]):
+                    rate[m] += body.coupling[m, j] * body.rates[finger, j]
+                if rate[m] != 0:
+                    bound = body.limits[m, 1] if rate[m] > 0 else body.limits[m, 0]
+                    end = max(end, (bound - start[m]) / rate[m])
+            full[:] = start
+            time, near = 0.0, False
+            x, y, z = carry(poses, body.tip_links[finger], body.tips, finger)
+            for _ in range(STEPS):
+                gap = interpolate(field, x, y, z) - body.tips[finger, 6]
+                near = gap < NEAR
+                time += gap / speeds[finger]
+                if near or time > end:
+                    break
+                for m in range(movable):
+                    if rate[m] != 0:
+                        full[m] = min(max(start[m] + rate[m] * time, body.limits[m, 0]), body.limits[m, 1])
+                for c in range(chains.shape[1]):
+                    if chains[finger, c] >= 0:
+                        place_link(body.motions, chains[finger, c], full, bases[i], poses)
+                x, y, z = carry(poses, body.tip_links[finger], body.tips, finger)
+            if not near:
+                status[i] = MISSED
+                break
+            for m in range(movable):
+                if rate[m] != 0:
+                    closed[i, m] = full[m]
+            nearest(field.tree, x, y, z, seed_at(field, x, y, z), hit)
+            touches[i, finger] = hit[1:7]
+    return status, closed, touches
