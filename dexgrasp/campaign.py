@@ -11,9 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dexgrasp.child import end_with_parent
-from dexgrasp.dataset.camera import Viewpoints
+from dexgrasp.dataset.camera import MeshScene, Viewpoints
 from dexgrasp.dataset.dataset import Dataset
-from dexgrasp.dataset.sensor import Framing, Sensor, capture
+from dexgrasp.dataset.framing import Framing
+from dexgrasp.dataset.sensor import Sensor, capture
 from dexgrasp.evaluation import Episode, Policy, attempt_rows, ceilings, clear, rate, summarise
 from dexgrasp.execution import pregrasp
 from dexgrasp.geometry import inverse
@@ -71,14 +72,13 @@ class Campaign:
         return episodes, results
 
     def look(self, scene: int, objects: list[Object], poses: Float[Tensor, "O 4 4"], seed: int) -> View:
-        """Return what the scene's fixed camera sees, with fresh noise."""
-        config = self.dataset.config
-        camera = read(Viewpoints, config["views"]["viewpoints"], "dataset.views.viewpoints").draw(
-            stream(self.seed, "viewpoint", scene)
-        )
+        """Return what the scene's fixed cameras see, with fresh noise."""
+        config, generator = self.dataset.config, stream(self.seed, "viewpoint", scene)
+        viewpoints = read(Viewpoints, config["views"]["viewpoints"], "dataset.views.viewpoints")
+        cameras = [viewpoints.draw(generator) for _ in range(config["views"].get("fused", 1))]
         framing = read(Framing, config["views"]["framing"], "dataset.views.framing")
-        meshes = [item.mesh for item in objects]
-        return capture(meshes, poses, camera, Sensor.build(config["camera"]), framing, stream(seed, "sensor"))
+        seen = MeshScene([item.mesh for item in objects], poses, self.dataset.scene(scene).fixtures)
+        return capture(seen, cameras, Sensor.build(config["camera"]), framing, stream(seed, "sensor"))
 
     def predict(self, view: View) -> Grasps:
         """Return the grasps that the network offers and that are worth trying, camera frame."""

@@ -52,7 +52,7 @@ def _thin(xyz: Float[Tensor, "P 3"], count: int, seed: int) -> Int[Tensor, "N"]:
     """Choose points as the training data's clouds are chosen: a large table does not crowd out what stands on it."""
     if len(xyz) <= count:
         return torch.arange(len(xyz))
-    from dexgrasp.dataset.sensor import Framing, downsample
+    from dexgrasp.dataset.framing import Framing, downsample
 
     return torch.from_numpy(downsample(xyz.numpy(), Framing(points=count), stream(seed, "thin", count)))
 

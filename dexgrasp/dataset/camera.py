@@ -1,21 +1,24 @@
-"""Pinhole depth cameras: where they stand, and what they see of triangle meshes on a table (embree)."""
+"""Pinhole depth cameras: where they stand, and what they see of triangle meshes on a table."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 import torch
 import trimesh
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from dexgrasp.geometry import look_at
+from dexgrasp.scene import Boxes
 
 TABLE, NOTHING = -1, -2
-"""Instances of a rendering that are no objects."""
+"""Instances of a rendering that are no objects; what stands fixed on the table counts as table."""
+CLOSEST = 1e-4
+"""Surfaces nearer to the camera's plane than this are not seen, m."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +40,13 @@ class Camera:
         x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
         return np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3).astype(np.float32)
 
+    @property
+    def intrinsics(self) -> Float[np.ndarray, "4"]:
+        """Focal lengths and principal point (fx, fy, cx, cy), px."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Rendering:
     """What an ideal camera would measure. Camera frame: x right, y down, z forward, metres."""
 
@@ -46,52 +54,127 @@ class Rendering:
     """z, float32; 0 where nothing is hit or the hit is out of range."""
     instance: Int[np.ndarray, "H W"]
     """Index of the object; `TABLE`, `NOTHING`."""
-    normals: Float[np.ndarray, "H W 3"]
-    """True unit normals of the triangles, towards the camera; 0 where nothing is hit."""
+    facet: Int[np.ndarray, "H W"]
+    """Index of the flat piece of surface that is seen; -1 where nothing is hit."""
+    facets: Float[np.ndarray, "T 3"]
+    """Unit normals of all pieces, to either side."""
+    camera: Camera
+
+    @property
+    def normals(self) -> Float[np.ndarray, "H W 3"]:
+        """True unit normals, towards the camera; 0 where nothing is hit."""
+        normals = np.where(self.facet.reshape(-1, 1) >= 0, self.facets[self.facet.ravel()], 0)
+        normals *= -np.sign((normals * self.camera.rays()).sum(axis=1, keepdims=True))
+        return normals.reshape(*self.depth.shape, 3)
 
 
-class RayScene:
-    """Meshes at rest on a table (z = 0), ready to be seen from anywhere. Built once, rendered often."""
+class MeshScene:
+    """Meshes at rest on a table (z = 0), ready to be seen from anywhere. Built once, rendered often.
 
-    def __init__(self, meshes: Sequence[trimesh.Trimesh], poses: Float[Tensor, "O 4 4"], table: float = 2.0) -> None:
+    A z-buffer: exact at pixel centres, as a ray through each would be, and it needs no search structure.
+    """
+
+    def __init__(
+        self,
+        meshes: Sequence[trimesh.Trimesh],
+        poses: Float[Tensor, "O 4 4"],
+        fixtures: Boxes | None = None,
+        table: float = 2.0,
+    ) -> None:
         """`poses` is world_T_object, NaN for objects that are not there; they keep their numbers.
 
-        `table` is the side of the square table about the world's origin, m (0: none).
+        `fixtures` stand beside them; `table` is the side of the square table about the world's origin, m (0: none).
         """
-        self._scene = EmbreeScene()
-        self._meshes: list[TriangleMesh] = []
-        self._instances: list[int] = []
-        for number, (mesh, pose) in enumerate(zip(meshes, poses.double().numpy(), strict=True)):
+        bodies = [(mesh, pose, number) for number, (mesh, pose) in enumerate(zip(meshes, poses, strict=True))]
+        if fixtures is not None:
+            boxes = [trimesh.creation.box(2 * half) for half in fixtures.halves.numpy()]
+            bodies += [(box, pose, TABLE) for box, pose in zip(boxes, fixtures.poses, strict=True)]
+        vertices, faces, owners, count = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [np.empty(0, np.int32)], 0
+        for mesh, where, number in bodies:
+            pose = where.double().numpy()
             if np.isfinite(pose).all():
-                self._add(mesh.vertices @ pose[:3, :3].T + pose[:3, 3], mesh.faces, number)
-        if table > 0:
-            corners = 0.5 * table * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-            self._add(corners, np.array([[0, 1, 2], [0, 2, 3]]), TABLE)
-
-    def _add(self, vertices: np.ndarray, faces: np.ndarray, instance: int) -> None:
-        self._instances.append(instance)
-        triangles = np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32)
-        self._meshes.append(TriangleMesh(self._scene, *triangles))
+                vertices.append(np.asarray(mesh.vertices) @ pose[:3, :3].T + pose[:3, 3])
+                faces.append(np.asarray(mesh.faces) + count)
+                owners.append(np.full(len(mesh.faces), number, np.int32))
+                count += len(mesh.vertices)
+        self._vertices, self._faces = np.concatenate(vertices), np.concatenate(faces)
+        self._owners = np.concatenate([*owners, [np.int32(TABLE), np.int32(NOTHING)]])
+        corners = self._vertices[self._faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-30
+        self._normals, self._table = np.concatenate([normals, [[0.0, 0.0, 1.0]]]), table
 
     def render(self, camera: Camera, world_T_camera: Float[Tensor, "4 4"]) -> Rendering:
-        """Return depth, instance and true normals of the first hit along each pixel's ray."""
+        """Return depth, instance and surface of what each pixel's centre sees."""
         pose = world_T_camera.double().numpy()
-        rotation = pose[:3, :3].astype(np.float32)
-        rays = camera.rays()
-        eye = np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape).copy()
-        hit = self._scene.run(eye, rays @ rotation.T, output=1)  # type: ignore[call-arg]
-        depth, instance = hit["tfar"], hit["geomID"]
-        seen = (instance >= 0) & (depth >= camera.near) & (depth <= camera.far)
-        instance = np.array([*self._instances, NOTHING])[instance]  # embree says -1 for a miss
-        normals = hit["Ng"] @ rotation
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-30
-        normals *= -np.sign((normals * rays).sum(axis=1, keepdims=True))
+        vertices = (self._vertices - pose[:3, 3]) @ pose[:3, :3]
+        table = np.array([*pose[2, :3], *pose[:2, :3].ravel(), *pose[:3, 3], self._table / 2])
         shape = (camera.height, camera.width)
-        return Rendering(
-            depth=np.where(seen, depth, 0).astype(np.float32).reshape(shape),
-            instance=np.where(seen, instance, NOTHING).astype(np.int32).reshape(shape),
-            normals=np.where(seen[:, None], normals, 0).reshape(*shape, 3),
-        )
+        depth, facet = _rasterise(vertices, self._faces, camera.intrinsics, shape, table, camera.near, camera.far)
+        facets = (self._normals @ pose[:3, :3]).astype(np.float32)
+        return Rendering(depth, self._owners[facet], facet, facets, camera)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _rasterise(
+    vertices: NDArray,
+    faces: NDArray,
+    intrinsics: NDArray,
+    shape: tuple[int, int],
+    table: NDArray,
+    near: float,
+    far: float,
+) -> tuple[NDArray, NDArray]:
+    """Return z (float32, 0 for nothing) and the triangle seen at each pixel; the table's number is their count."""
+    fx, fy, cx, cy = intrinsics
+    height, width = shape
+    inverse, facet = np.zeros(shape), np.full(shape, -1, np.int32)
+    if table[12] > 0 and table[11] > 0:
+        for v in range(height):
+            for u in range(width):
+                a, b = (u - cx) / fx, (v - cy) / fy
+                fall = -(table[0] * a + table[1] * b + table[2])
+                if fall > 1e-9:
+                    z = table[11] / fall
+                    x = table[9] + z * (table[3] * a + table[4] * b + table[5])
+                    y = table[10] + z * (table[6] * a + table[7] * b + table[8])
+                    if abs(x) <= table[12] and abs(y) <= table[12]:
+                        inverse[v, u], facet[v, u] = 1 / z, len(faces)
+    us, vs, zs = np.empty(len(vertices)), np.empty(len(vertices)), np.empty(len(vertices))
+    for k in range(len(vertices)):
+        zs[k] = 1 / vertices[k, 2]
+        us[k], vs[k] = fx * vertices[k, 0] * zs[k] + cx, fy * vertices[k, 1] * zs[k] + cy
+    for t in range(len(faces)):
+        i, j, k = faces[t]
+        if min(vertices[i, 2], vertices[j, 2], vertices[k, 2]) < CLOSEST:
+            continue
+        left, right = max(math.ceil(min(us[i], us[j], us[k])), 0), min(math.floor(max(us[i], us[j], us[k])), width - 1)
+        top, bottom = max(math.ceil(min(vs[i], vs[j], vs[k])), 0), min(math.floor(max(vs[i], vs[j], vs[k])), height - 1)
+        area = (us[j] - us[i]) * (vs[k] - vs[i]) - (us[k] - us[i]) * (vs[j] - vs[i])
+        if left > right or top > bottom or area == 0:
+            continue
+        # Barycentric weights are linear in the image, and so is 1 / z.
+        jx, jy = (vs[k] - vs[i]) / area, -(us[k] - us[i]) / area
+        kx, ky = -(vs[j] - vs[i]) / area, (us[j] - us[i]) / area
+        for v in range(top, bottom + 1):
+            for u in range(left, right + 1):
+                b = jx * (u - us[i]) + jy * (v - vs[i])
+                c = kx * (u - us[i]) + ky * (v - vs[i])
+                if b < -1e-9 or c < -1e-9 or b + c > 1 + 1e-9:
+                    continue
+                w = zs[i] + b * (zs[j] - zs[i]) + c * (zs[k] - zs[i])
+                if w > inverse[v, u]:
+                    inverse[v, u], facet[v, u] = w, t
+    depth = np.zeros(shape, np.float32)
+    for v in range(height):
+        for u in range(width):
+            if facet[v, u] >= 0:
+                z = 1 / inverse[v, u]
+                if near <= z <= far:
+                    depth[v, u] = z
+                else:
+                    facet[v, u] = -1
+    return depth, facet
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dexgrasp.dataset.camera import Viewpoints
+from dexgrasp.dataset.camera import MeshScene, Viewpoints
 from dexgrasp.dataset.clutter import Approach, Clutter, build_scene, clear, feasible
 from dexgrasp.dataset.dataset import Dataset
+from dexgrasp.dataset.framing import Framing
 from dexgrasp.dataset.labels import LabelSettings, label
-from dexgrasp.dataset.sensor import Framing, Sensor, capture
+from dexgrasp.dataset.sensor import Sensor, capture
 from dexgrasp.dataset.shard import Item
 from dexgrasp.dataset.synthesis import synthesize
 from dexgrasp.dataset.synthesis_settings import SynthesisSettings
@@ -75,14 +76,13 @@ def make_scene(dataset: Dataset, index: int) -> Item:
 
 
 def make_view(dataset: Dataset, index: int) -> Item:
-    """Look at a scene from a random viewpoint."""
+    """Look at a scene from a random viewpoint, or from several for one cloud."""
     settings = settings_of(dataset)
     number = dataset.scene_of(index)
     scene = dataset.scene(number)
     generator = stream(dataset.config["seed"], "view", index)
-    world_T_camera = settings.viewpoints.draw(generator)
-    meshes = [dataset.objects[name].mesh for name in scene.objects]
-    view = capture(meshes, scene.poses, world_T_camera, settings.sensor, settings.framing, generator)
+    cameras = [settings.viewpoints.draw(generator) for _ in range(settings.fused)]
+    view = capture(mesh_scene(dataset, number), cameras, settings.sensor, settings.framing, generator)
     tensors = {
         "points": view.points,
         "normals": view.normals,
@@ -91,6 +91,13 @@ def make_view(dataset: Dataset, index: int) -> Item:
     }
     seen = view.instance[view.instance >= 0].bincount(minlength=len(scene)).tolist()
     return Item(key(index), tensors, {"scene": number, "points_on_objects": seen})
+
+
+@lru_cache(2)
+def mesh_scene(dataset: Dataset, number: int) -> MeshScene:
+    """Return scene `number` ready to be seen; views of one scene follow each other and share it."""
+    scene = dataset.scene(number)
+    return MeshScene([dataset.objects[name].mesh for name in scene.objects], scene.poses, scene.fixtures)
 
 
 def make_labels(dataset: Dataset, index: int) -> Item:
@@ -138,6 +145,7 @@ class Settings:
     sensor: Sensor
     viewpoints: Viewpoints
     framing: Framing
+    fused: int
     points: LabelSettings
     truth: TruthSettings
 
@@ -146,9 +154,11 @@ class Settings:
         """Return the settings of a resolved config; raises DexgraspError for unknown or missing keys."""
         scenes, views, labels = dict(config["scenes"]), config["views"], config["labels"]
         count, per_object = scenes.pop("count"), scenes.pop("grasps_per_object")
+        fused = views.get("fused", 1)
         numbers = {"scenes.count": count, "scenes.grasps_per_object": per_object, "views.per_scene": views["per_scene"]}
+        numbers["views.fused"] = fused
         for key, value in numbers.items():
-            least = 1 if key == "scenes.count" else 0
+            least = 1 if key in ("scenes.count", "views.fused") else 0
             if type(value) is not int or value < least:
                 raise DexgraspError(f"dataset.{key} to be a whole number of at least {least}", repr(value), "set it so")
         return cls(
@@ -160,6 +170,7 @@ class Settings:
             Sensor.build(config["camera"]),
             read(Viewpoints, views["viewpoints"], "dataset.views.viewpoints"),
             read(Framing, views["framing"], "dataset.views.framing"),
+            fused,
             read(LabelSettings, labels["points"], "dataset.labels.points"),
             read(TruthSettings, labels["truth"], "dataset.labels.truth"),
         )
