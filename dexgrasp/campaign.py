@@ -106,10 +106,10 @@ def _work(campaign: Campaign, index: int, label_ceilings: bool) -> tuple[Episode
         dataset = campaign.dataset
         simulator = MujocoSimulator(dataset.config["simulator"]["settling"])
         objects = [dataset.objects[name] for name in dataset.scene(index).objects]
-        poses = dataset.scene(index).poses.double()
+        poses, fixtures = dataset.scene(index).poses.double(), dataset.scene(index).fixtures
         common = (dataset.hand, simulator, campaign.protocol)
         verdicts = (
-            ceilings(index, objects, poses, dataset.scene_grasps(index), *common, campaign.seed)
+            ceilings(index, objects, poses, dataset.scene_grasps(index), *common, campaign.seed, fixtures)
             if label_ceilings
             else {}
         )
@@ -126,6 +126,7 @@ def _work(campaign: Campaign, index: int, label_ceilings: bool) -> tuple[Episode
             campaign.seed,
             campaign.reached,
             draw=index < campaign.drawn,
+            fixtures=fixtures,
         )
         return episode, verdicts
     finally:

@@ -17,7 +17,7 @@ from dexgrasp.geometry import inverse, rotation_angle
 from dexgrasp.grasps import Grasps, Reason
 from dexgrasp.hand import Hand
 from dexgrasp.objects import Object
-from dexgrasp.scene import View
+from dexgrasp.scene import Boxes, View
 from dexgrasp.seeds import stream
 from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.simulation.simulator import Simulator
@@ -86,6 +86,7 @@ def clear(
     seed: int,
     epsilon: Epsilon | None = None,
     draw: bool = False,
+    fixtures: Boxes | None = None,
 ) -> Episode:
     """Clear one scene, at most ``policy.attempts_per_object`` attempts per object.
 
@@ -113,7 +114,7 @@ def clear(
             break
         seen = _target(chosen, view)
         target = None if seen is None else standing[seen]
-        outcome = simulator.execute(objects, poses, hand, chosen, protocol)
+        outcome = simulator.execute(objects, poses, hand, chosen, protocol, fixtures=fixtures)
         seconds["execute"] = time.perf_counter() - predicted
         success, row = bool(outcome.success[0]), int(outcome.object[0])
         attempts.append(
@@ -136,7 +137,7 @@ def clear(
             removed.append(names[row])
             after[row] = math.nan
         failed += [] if success else [chosen]
-        poses = simulator.settle(objects, after, _seed(seed, "settle", index, len(attempts))).to(poses)
+        poses = simulator.settle(objects, after, _seed(seed, "settle", index, len(attempts)), fixtures).to(poses)
     return Episode(index, names, tuple(removed), tuple(attempts), tuple(strips))
 
 
@@ -164,6 +165,7 @@ def ceilings(
     simulator: Simulator,
     protocol: Protocol,
     seed: int,
+    fixtures: Boxes | None = None,
 ) -> dict[str, list[bool]]:
     """Execute, for each object of the untouched scene, its best label by epsilon and a random one.
 
@@ -179,7 +181,9 @@ def ceilings(
         chosen["random"].append(labels[int(own[int(stream(seed, "ceiling", index, row).integers(len(own)))])])
     verdicts: dict[str, list[bool]] = {}
     for kind, grasps in chosen.items():
-        outcomes = simulator.execute(objects, poses, hand, Grasps.cat(grasps), protocol) if grasps else None
+        outcomes = (
+            simulator.execute(objects, poses, hand, Grasps.cat(grasps), protocol, fixtures=fixtures) if grasps else None
+        )
         verdicts[kind] = [] if outcomes is None else [bool(x) for x in outcomes.success]
     return verdicts
 

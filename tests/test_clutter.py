@@ -7,7 +7,8 @@ import trimesh
 
 from dexgrasp import load_hand
 from dexgrasp.collision import HandShape
-from dexgrasp.dataset.clutter import Approach, Clutter, approachable, build_scene, feasible, place, separation
+from dexgrasp.dataset.arrangement import Clutter, build_scene, place, separation
+from dexgrasp.dataset.clutter import Approach, approachable, feasible
 from dexgrasp.distance import DistanceField
 from dexgrasp.execution import pregrasp
 from dexgrasp.geometry import pose as rigid

@@ -52,11 +52,11 @@ class Script(Simulator):
     def __init__(self, fails: int = 0) -> None:
         self.fails, self.settled = fails, 0
 
-    def settle(self, objects, poses, seed):
+    def settle(self, objects, poses, seed, fixtures=None):
         self.settled += 1
         return poses
 
-    def execute(self, objects, poses, hand, grasps, protocol, target=None):
+    def execute(self, objects, poses, hand, grasps, protocol, target=None, fixtures=None):
         count = len(grasps)
         success = torch.ones(count, dtype=torch.bool)
         if self.fails > 0:
@@ -163,9 +163,9 @@ def test_ceilings_take_best_and_random_of_each_object():
     seen = []
 
     class Spy(Script):
-        def execute(self, objects, poses, hand, grasps, protocol, target=None):
+        def execute(self, objects, poses, hand, grasps, protocol, target=None, fixtures=None):
             seen.append(grasps)
-            return super().execute(objects, poses, hand, grasps, protocol, target)
+            return super().execute(objects, poses, hand, grasps, protocol, target, fixtures)
 
     verdicts = ceilings(0, things(3), poses(3), labels, HAND, Spy(), PROTOCOL, 0)
     assert verdicts == {"best_epsilon": [True, True], "random": [True, True]}

@@ -22,7 +22,7 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
 from dexgrasp.objects import ObjectSet, object_from_tensors
-from dexgrasp.scene import Scene, View
+from dexgrasp.scene import Boxes, Scene, View
 
 if TYPE_CHECKING:
     from dexgrasp.closing import Closer
@@ -151,7 +151,8 @@ class Dataset:
         """Return scene `index`."""
         item = self.store("scenes")[index]
         names = tuple(self.objects[int(i)].name for i in item.tensors["object"])
-        return Scene(names, item.tensors["poses"], item.facts["seed"])
+        fixtures = Boxes(item.tensors["fixture_poses"], item.tensors["fixture_halves"])
+        return Scene(names, item.tensors["poses"], item.facts["seed"], fixtures)
 
     def scene_objects(self, index: int) -> Int[Tensor, "O"]:
         """Return which objects of the set stand in scene `index`."""

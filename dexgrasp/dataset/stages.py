@@ -8,8 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dexgrasp.dataset.arrangement import Clutter, build_scene
 from dexgrasp.dataset.camera import MeshScene, Viewpoints
-from dexgrasp.dataset.clutter import Approach, Clutter, build_scene, clear, feasible
+from dexgrasp.dataset.clutter import Approach, clear, feasible
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.framing import Framing
 from dexgrasp.dataset.labels import LabelSettings, label
@@ -52,8 +53,7 @@ def make_scene(dataset: Dataset, index: int) -> Item:
     """Lay out scene `index` and find, among some grasps of each object, those that are free of all others."""
     config, objects = dataset.config, dataset.objects
     settings = settings_of(dataset)
-    simulator = MujocoSimulator(config["simulator"]["settling"])
-    scene = build_scene(objects, settings.clutter, simulator, config["seed"], index)
+    scene = build_scene(objects, settings.clutter, _settler(config["simulator"]["settling"]), config["seed"], index)
     numbers = [objects.names.index(name) for name in scene.objects]
     chosen, moved = [], [dataset.grasps(0)[:0].to(torch.float64)]
     for row, number in enumerate(numbers):
@@ -64,15 +64,22 @@ def make_scene(dataset: Dataset, index: int) -> Item:
         moved.append(world.replace(object=torch.full((len(world),), row)))
     grasps = Grasps.cat(moved)
     obstacles = [dataset.field(number) for number in numbers]
-    free = feasible(dataset.shape, dataset.hand, grasps, scene.poses, obstacles, settings.approach)
+    free = feasible(dataset.shape, dataset.hand, grasps, scene.poses, obstacles, settings.approach, scene.fixtures)
     tensors = {
         "poses": scene.poses,
         "object": torch.tensor(numbers, dtype=torch.int32),
         "grasp_object": grasps.object[free].int(),
         "grasp": torch.cat(chosen)[free].int(),
+        "fixture_poses": scene.fixtures.poses,
+        "fixture_halves": scene.fixtures.halves,
     }
     facts = {"objects": scene.objects, "seed": scene.seed, "grasps_tried": len(grasps), "grasps": int(free.sum())}
     return Item(key(index), tensors, facts)
+
+
+@lru_cache(1)
+def _settler(protocol: str) -> MujocoSimulator:
+    return MujocoSimulator(protocol)
 
 
 def make_view(dataset: Dataset, index: int) -> Item:
@@ -122,7 +129,7 @@ def scene_truth(dataset: Dataset, index: int, world_T_frame: Tensor) -> Truth:
 
     def is_clear(told: Grasps) -> Tensor:
         world = told.to(torch.float64).moved(world_T_frame)
-        return clear(dataset.shape, dataset.hand, world, scene.poses, obstacles, settings.approach)
+        return clear(dataset.shape, dataset.hand, world, scene.poses, obstacles, settings.approach, scene.fixtures)
 
     return Truth(dataset.closer, bodies, inverse(world_T_frame) @ scene.poses, settings.truth, is_clear)
 

@@ -14,6 +14,7 @@ from dexgrasp.execution import closing_direction, pregrasp, tilted
 from dexgrasp.grasps import Grasps, Outcomes, Reason
 from dexgrasp.hand import Hand
 from dexgrasp.objects import Object
+from dexgrasp.scene import Boxes
 from dexgrasp.simulation.attempt import Attempt, Plan, Result
 from dexgrasp.simulation.protocol import Physics, Protocol, load_protocol
 from dexgrasp.simulation.simulator import Simulator
@@ -36,10 +37,12 @@ class MujocoSimulator(Simulator):
         self.settling = settling if isinstance(settling, Protocol) else load_protocol(settling)
         self._worlds: OrderedDict[Any, tuple[Any, World]] = OrderedDict()
 
-    def settle(self, objects: Sequence[Object], poses: Float[Tensor, "O 4 4"], seed: int) -> Float[Tensor, "O 4 4"]:
+    def settle(
+        self, objects: Sequence[Object], poses: Float[Tensor, "O 4 4"], seed: int, fixtures: Boxes | None = None
+    ) -> Float[Tensor, "O 4 4"]:
         """Let go of the objects; see `Simulator.settle`. MuJoCo draws no random numbers: `seed` has no effect."""
         physics = self.settling.physics
-        world = self.world(objects, None, physics)
+        world = self.world(objects, None, physics, fixtures)
         world.reset(poses.detach().double().cpu().numpy())
         quiet, looks = 0, max(round(physics.rest_time / (REST_STEPS * physics.timestep)), 1)
         for step in range(round(physics.settle_time / physics.timestep)):
@@ -60,9 +63,10 @@ class MujocoSimulator(Simulator):
         grasps: Grasps,
         protocol: Protocol,
         target: Int[Tensor, "N"] | None = None,
+        fixtures: Boxes | None = None,
     ) -> Outcomes:
         """Carry out each grasp from the same initial scene; see `Simulator.execute`."""
-        world = self.world(objects, hand, protocol.physics)
+        world = self.world(objects, hand, protocol.physics, fixtures)
         initial = poses.detach().double().cpu().numpy()
         grasps = grasps.to("cpu", torch.float64)
         skipped = tilted(hand, grasps, protocol.verdict.max_tilt).tolist()
@@ -80,11 +84,14 @@ class MujocoSimulator(Simulator):
             results.append(Attempt(world, initial, plan, protocol, aim).run())
         return _outcomes(results, len(objects), poses)
 
-    def world(self, objects: Sequence[Object], hand: Hand | None, physics: Physics) -> World:
+    def world(
+        self, objects: Sequence[Object], hand: Hand | None, physics: Physics, fixtures: Boxes | None = None
+    ) -> World:
         """Return the compiled world of these objects, from the few that are kept or a new one."""
-        key = (tuple(map(id, objects)), id(hand), physics)
+        walls = b"" if fixtures is None else fixtures.poses.numpy().tobytes() + fixtures.halves.numpy().tobytes()
+        key = (tuple(map(id, objects)), id(hand), physics, walls)
         if key not in self._worlds:
-            self._worlds[key] = ((tuple(objects), hand), World(objects, hand, physics))  # keeps the ids taken
+            self._worlds[key] = ((tuple(objects), hand), World(objects, hand, physics, fixtures))  # keeps the ids taken
             if len(self._worlds) > KEPT_WORLDS:
                 self._worlds.popitem(last=False)
         self._worlds.move_to_end(key)

@@ -9,6 +9,7 @@ from torch import Tensor
 from dexgrasp.grasps import Grasps, Outcomes
 from dexgrasp.hand import Hand
 from dexgrasp.objects import Object
+from dexgrasp.scene import Boxes
 from dexgrasp.simulation.protocol import Protocol
 
 
@@ -20,10 +21,13 @@ class Simulator(ABC):
     """
 
     @abstractmethod
-    def settle(self, objects: Sequence[Object], poses: Float[Tensor, "O 4 4"], seed: int) -> Float[Tensor, "O 4 4"]:
+    def settle(
+        self, objects: Sequence[Object], poses: Float[Tensor, "O 4 4"], seed: int, fixtures: Boxes | None = None
+    ) -> Float[Tensor, "O 4 4"]:
         """Let go of the objects at `poses` (world_T_object, m) and return where they come to rest.
 
-        NaN for objects that were absent or left the table. `seed` is for engines that draw random numbers.
+        NaN for objects that were absent or left the table. `fixtures` stand fixed on it. `seed` is for engines that draw
+        random numbers.
         """
 
     @abstractmethod
@@ -35,6 +39,7 @@ class Simulator(ABC):
         grasps: Grasps,
         protocol: Protocol,
         target: Int[Tensor, "N"] | None = None,
+        fixtures: Boxes | None = None,
     ) -> Outcomes:
         """Carry out each grasp (world frame), each from the same initial scene, by the rules of `protocol`.
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dexgrasp.hand import Hand
 from dexgrasp.objects import Object
+from dexgrasp.scene import Boxes
 from dexgrasp.simulation.hand_model import add_hand, quaternion
 from dexgrasp.simulation.protocol import Physics
 
@@ -29,9 +30,13 @@ class World:
         present: (O,) bool, objects that are there.
     """
 
-    def __init__(self, objects: Sequence[Object], hand: Hand | None, physics: Physics) -> None:
+    def __init__(
+        self, objects: Sequence[Object], hand: Hand | None, physics: Physics, fixtures: Boxes | None = None
+    ) -> None:
         self.hand, self.physics = hand, physics
         spec = _world(physics)
+        if fixtures is not None:
+            _add_fixtures(spec, fixtures, physics)
         for number, item in enumerate(objects):
             _add_object(spec, number, item, physics)
         if hand is not None:
@@ -156,6 +161,18 @@ def _world(physics: Physics) -> mujoco.MjSpec:
         friction=[physics.friction, physics.torsional_friction, physics.rolling_friction],
     )
     return spec
+
+
+def _add_fixtures(spec: mujoco.MjSpec, fixtures: Boxes, physics: Physics) -> None:
+    for pose, half in zip(fixtures.poses.numpy(), fixtures.halves.numpy(), strict=True):
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=half,
+            pos=pose[:3, 3],
+            quat=quaternion(pose[:3, :3]),
+            condim=6,
+            friction=[physics.friction, physics.torsional_friction, physics.rolling_friction],
+        )
 
 
 def _add_object(spec: mujoco.MjSpec, number: int, item: Object, physics: Physics) -> None:
