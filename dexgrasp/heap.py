@@ -8,7 +8,7 @@ from numba import njit
 
 
 @njit(cache=True)
-def push(keys: np.ndarray, items: np.ndarray, size: int, key: float, item: int) -> int:
+def push(keys: np.ndarray, items: np.ndarray, size: int, key: float, item: int | np.uint32) -> int:
     """Add an entry to a heap of `size`; the arrays have room for it."""
     i = size
     while i > 0 and keys[(i - 1) >> 1] > key:

@@ -1,7 +1,7 @@
-"""Grasp quality: contact wrenches and the Ferrari-Canny epsilon (METHOD section 5).
+"""Grasp quality of wrench sets: the Ferrari-Canny epsilon and the volume of their hulls (METHOD section 5).
 
-Every epsilon is a number about a wrench set; what made the set (torque origin and scale, friction, cone edges, unit
-normal force per contact, hull of all cone edges = L1) travels with it as arguments of `wrenches`.
+Every such figure is about a wrench set; what made the set (torque origin and scale, friction, torsion, cone edges, unit
+normal force per contact, hull) are arguments here and travel with the figure as a `wrench_model.WrenchModel`.
 """
 
 import math
@@ -10,70 +10,104 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dexgrasp.contact_wrenches import compiled_wrenches, cone_edges, differentiable_wrenches
 from dexgrasp.errors import DexgraspError
-from dexgrasp.wrench_hull import DECIDE, SIZE, evaluate
+from dexgrasp.wrench_hull import DECIDE, FACET, SIZE, VOLUME, evaluate
 
 Array = Tensor | np.ndarray
 
 
 def wrenches(
-    contacts: Array, normals: Array, origin: Array, scale: float, friction: float = 0.5, edges: int = 8
+    contacts: Array,
+    normals: Array,
+    origin: Array,
+    scale: float,
+    friction: float = 0.5,
+    edges: int = 8,
+    torsion: float = 0.0,
 ) -> Array:
-    """Return the cone-edge wrenches (N, F * edges, 6) of point contacts with friction.
+    """Return the cone-edge wrenches (N, F * P, 6) of point contacts with friction.
 
     contacts (N, F, 3) in m and normals (N, F, 3), outward and unit, share one frame with origin (3,), about which
     torques are taken. Edge k of a cone is f = n_in + friction (cos(a) t_x + sin(a) t_y), a = 2 pi k / edges: unit
     normal force. A wrench is (f, (p - origin) x f / scale); scale (m) is usually the largest distance from origin to
-    the surface. A contact of NaN gives zero wrenches. Ferrari & Canny 1992; differentiable for tensors.
+    the surface. With torsion (m) > 0 contacts are soft fingers: P = 3 edges + 2 wrenches on an ellipsoid instead of
+    P = edges, the others with a torque about the normal too (`contact_wrenches.cone_edges`). A contact of NaN gives
+    zero wrenches. Ferrari & Canny 1992; differentiable for tensors that require it.
     """
-    if scale <= 0 or edges < 3 or friction < 0:
+    if not (scale > 0 and edges >= 3 and friction >= 0 and torsion >= 0):
         raise DexgraspError(
-            "scale > 0, edges >= 3, friction >= 0", f"{scale=}, {edges=}, {friction=}", "mend the wrench model"
+            "scale > 0, edges >= 3, friction >= 0, torsion >= 0",
+            f"{scale=}, {edges=}, {friction=}, {torsion=}",
+            "mend the wrench model",
         )
-    if isinstance(contacts, np.ndarray):
-        return _wrenches(torch.from_numpy(contacts), normals, origin, scale, friction, edges).numpy()
-    return _wrenches(contacts, normals, origin, scale, friction, edges)
+    cone = cone_edges(edges, torsion > 0)
+    tensors = [value for value in (contacts, normals) if isinstance(value, Tensor)]
+    if any(value.requires_grad or value.device.type != "cpu" for value in tensors):
+        points, outward, about, table = (
+            torch.as_tensor(value).to(tensors[0]) for value in (contacts, normals, origin, cone)
+        )
+        return differentiable_wrenches(points, outward, about, scale, friction, torsion, table)
+    dense = [np.ascontiguousarray(value, dtype=np.float64) for value in (contacts, normals, origin)]
+    result = compiled_wrenches(dense[0], dense[1], dense[2], float(scale), float(friction), float(torsion), cone)
+    return torch.from_numpy(result).to(contacts.dtype) if isinstance(contacts, Tensor) else result
 
 
-def _wrenches(contacts: Tensor, normals: Array, origin: Array, scale: float, friction: float, edges: int) -> Tensor:
-    normals, origin = torch.as_tensor(normals).to(contacts), torch.as_tensor(origin).to(contacts)
-    touched = ~(contacts.isnan().any(-1, keepdim=True) | normals.isnan().any(-1, keepdim=True))
-    arm = torch.where(touched, (contacts - origin) / scale, 0.0)
-    inward = torch.where(touched, -normals, 0.0)
-    # The axis least along the normal fixes the first tangent.
-    axis = torch.nn.functional.one_hot(inward.abs().argmin(-1), 3).to(inward)
-    t_x = torch.nn.functional.normalize(torch.linalg.cross(inward, axis), dim=-1)
-    t_y = torch.linalg.cross(inward, t_x)
-    angle = torch.arange(edges).to(contacts) * (2 * math.pi / edges)
-    tangent = torch.cos(angle)[:, None] * t_x.unsqueeze(-2) + torch.sin(angle)[:, None] * t_y.unsqueeze(-2)
-    force = inward.unsqueeze(-2) + friction * tangent
-    torque = torch.linalg.cross(arm.unsqueeze(-2).expand_as(force), force)
-    return torch.cat([force, torque], dim=-1).flatten(-3, -2)
-
-
-def epsilon(wrenches: Array, threshold: float | None = None) -> Array:
+def epsilon(wrenches: Array, threshold: float | None = None, contacts: int = 0) -> Array:
     """Return the radius (N,) of the largest ball about the origin inside each hull of wrenches (N, W, 6).
 
     Exact to 1e-11 for wrenches of order 1; exactly 0 where the origin is not strictly inside or the set spans fewer
     than six dimensions. With a threshold, sets certified to lie below it give 0 at once and the others stay exact.
+    The hull is L1, that of all wrenches; with `contacts` > 0, to which the wrenches belong in order and equal parts,
+    it is L-infinity: the Minkowski sum over contacts of conv(0, their wrenches), every finger pressing up to 1.
     """
-    return _run(wrenches, -math.inf if threshold is None else threshold, False)
+    return _as(wrenches, _evaluate(wrenches, contacts, -math.inf if threshold is None else threshold, SIZE)[0])
 
 
-def reaches(wrenches: Array, threshold: float) -> Array:
+def reaches(wrenches: Array, threshold: float, contacts: int = 0) -> Array:
     """Return whether epsilon >= threshold (> 0) for each set (N, W, 6): the fastest filter, certified both ways."""
-    return _run(wrenches, threshold, True) >= threshold
+    return _as(wrenches, _evaluate(wrenches, contacts, threshold, DECIDE)[0]) >= threshold
 
 
-def _run(wrenches: Array, threshold: float, decide: bool) -> Array:
+def volume(wrenches: Array, contacts: int = 0) -> Array:
+    """Return the 6-D volume (N,) of each hull of wrenches (N, W, 6); 0 for sets of fewer dimensions."""
+    return _as(wrenches, _evaluate(wrenches, contacts, -math.inf, VOLUME)[0])
+
+
+def nearest_facet(wrenches: Array, contacts: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return epsilon (N,), the unit normal (N, 6) of the facet nearest the origin, and its wrenches' numbers (N, 6).
+
+    Numbers are for the L1 hull. Where epsilon is 0, no wrench reaches beyond the origin along the normal, which is
+    then one that shows it (zeros for sets of fewer than six dimensions), and the numbers are -1.
+    """
+    return _evaluate(wrenches, contacts, -math.inf, FACET)
+
+
+def _evaluate(
+    wrenches: Array, contacts: int, threshold: float, wanted: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if wrenches.ndim != 3 or wrenches.shape[-1] != 6:
         raise DexgraspError("wrenches of shape (N, W, 6)", f"shape {tuple(wrenches.shape)}", "stack sets of wrenches")
-    if isinstance(wrenches, np.ndarray):
-        dense = np.ascontiguousarray(wrenches, dtype=np.float64)
-    else:
-        dense = np.ascontiguousarray(wrenches.detach().cpu().numpy(), dtype=np.float64)
+    if contacts < 0 or (contacts and wrenches.shape[1] % contacts):
+        raise DexgraspError(
+            "as many wrenches from every contact", f"{wrenches.shape[1]} wrenches of {contacts} contacts", "count again"
+        )
+    if isinstance(wrenches, Tensor):
+        wrenches = wrenches.detach().cpu().numpy()
+    dense = np.ascontiguousarray(wrenches, dtype=np.float64)
     if not np.isfinite(dense).all():
         raise DexgraspError("finite wrenches", "NaN or infinity", "give untouched contacts zero wrenches")
-    empty = not dense.shape[1]
-    result = np.zeros(len(dense)) if empty else evaluate(dense, 0, float(threshold), DECIDE if decide else SIZE)[0]
-    return result if isinstance(wrenches, np.ndarray) else torch.from_numpy(result).to(wrenches)
+    if not dense.shape[1]:
+        return np.zeros(len(dense)), np.zeros((len(dense), 6)), np.full((len(dense), 6), -1)
+    found = evaluate(dense, int(contacts), float(threshold), wanted)
+    if np.isnan(found[0]).any():
+        raise DexgraspError(
+            "wrenches of order 1",
+            f"set {int(np.isnan(found[0]).argmax())} too near to degenerate for its size",
+            "scale torques by the object's radius, forces by the normal force",
+        )
+    return found
+
+
+def _as(given: Array, result: np.ndarray) -> Array:
+    return result if isinstance(given, np.ndarray) else torch.from_numpy(result).to(given)

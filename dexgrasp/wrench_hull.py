@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from dexgrasp.heap import pop, push
-from dexgrasp.wrench_support import DIM, ZERO, determinant, dot, random_words, row, simplex, simplex_normals, support
+from dexgrasp.wrench_support import DIM, ZERO, Vector, determinant, dot, random_words, row, simplex, simplex_normals, support
 
 COPLANAR = 1e-11
 """Points this little above a facet's plane (wrenches of order 1) count as on it: the facet is final, bounds have met.
@@ -73,7 +73,7 @@ def evaluate(
 
 
 @njit(cache=True)
-def _plane(planes: np.ndarray, f: int) -> tuple[float, float, float, float, float, float]:
+def _plane(planes: np.ndarray, f: int) -> Vector:
     at = 8 * f
     return planes[at], planes[at + 1], planes[at + 2], planes[at + 3], planes[at + 4], planes[at + 5]
 
@@ -100,7 +100,7 @@ def _begin(
         planes[8 * f + DISTANCE] = dot(row(normals, f), row(corners, 1 if f == 0 else 0))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _grow(
     planes: np.ndarray, links: np.ndarray, hashes: np.ndarray, keys: np.ndarray, items: np.ndarray,
     visible: np.ndarray, ridges: np.ndarray, table: np.ndarray, pairs: np.ndarray, corners: np.ndarray,
@@ -177,6 +177,8 @@ def _grow(
             n3, n4, n5 = a * x[3] - b * y[3], a * x[4] - b * y[4], a * x[5] - b * y[5]
             x = n0, n1, n2, n3, n4, n5
             scale, at = 1.0 / np.sqrt(dot(x, x)), 8 * new
+            if scale * tolerance > 1.0:
+                return TORN
             planes[at], planes[at + 1], planes[at + 2] = n0 * scale, n1 * scale, n2 * scale
             planes[at + 3], planes[at + 4], planes[at + 5] = n3 * scale, n4 * scale, n5 * scale
             planes[at + DISTANCE] = dot(x, p) * scale

@@ -9,24 +9,26 @@ import numpy as np
 from numba import njit
 
 DIM = 6
+Vector = tuple[float, float, float, float, float, float]
+"""Of six numbers, in registers."""
 ZERO = 1e-10
 """An epsilon, or a thickness of the whole set, below this is zero (wrenches of order 1)."""
 
 
 @njit(cache=True)
-def row(array: np.ndarray, i: int) -> tuple[float, float, float, float, float, float]:
+def row(array: np.ndarray, i: int) -> Vector:
     """Read one row of an array (N, 6) into registers."""
     return array[i, 0], array[i, 1], array[i, 2], array[i, 3], array[i, 4], array[i, 5]
 
 
 @njit(cache=True)
-def dot(a: np.ndarray, b: np.ndarray) -> float:
+def dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
 
 
 @njit(cache=True)
 def support(
-    wrenches: np.ndarray, contacts: int, u: np.ndarray, values: np.ndarray, corners: np.ndarray, apex: int
+    wrenches: np.ndarray, contacts: int, u: Vector, values: np.ndarray, corners: np.ndarray, apex: int
 ) -> tuple[float, int]:
     """Write the hull's farthest point along u as row `apex` of corners; return h(u) and, for L1, its wrench."""
     count = wrenches.shape[1]
@@ -135,7 +137,7 @@ def simplex(
 
 @njit(cache=True)
 def _farther(
-    wrenches: np.ndarray, contacts: int, u: np.ndarray, values: np.ndarray, corners: np.ndarray, step: int
+    wrenches: np.ndarray, contacts: int, u: Vector, values: np.ndarray, corners: np.ndarray, step: int
 ) -> None:
     """Write as corner `step` the hull's farthest point from corner 0 along u, to either side."""
     support(wrenches, contacts, u, values, corners, step)

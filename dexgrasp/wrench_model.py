@@ -1,0 +1,96 @@
+"""What an epsilon is about, as one value that is stored with it: `WrenchModel`, and `Quality`, figures with theirs."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from torch import Tensor
+
+from dexgrasp import quality
+from dexgrasp.contact_wrenches import cone_edges
+from dexgrasp.errors import DexgraspError
+
+Array = Tensor | np.ndarray
+HULLS = ("l1", "linf")
+
+
+@dataclass(frozen=True)
+class WrenchModel:
+    """How contacts become wrenches and wrenches a figure (METHOD section 5); compares, hashes, and goes to JSON."""
+
+    origin: tuple[float, float, float]
+    """About which torques are taken, m, in the frame of the contacts; usually the centre of mass."""
+    scale: float
+    """Torques are divided by it, m; usually the largest distance from the origin to the surface."""
+    friction: float = 0.5
+    edges: int = 8
+    """Of a friction cone, which is inscribed: epsilon grows with their number."""
+    torsion: float = 0.0
+    """Torque about the normal that unit normal force can hold, m; 0: hard finger, else soft finger."""
+    hull: Literal["l1", "linf"] = "l1"
+    """Normal forces that sum up to 1 (hull of all wrenches), or of up to 1 each (Minkowski sum over contacts)."""
+
+    def __post_init__(self) -> None:
+        origin: Sequence[float] = tuple(float(value) for value in self.origin)
+        object.__setattr__(self, "origin", origin)
+        object.__setattr__(self, "scale", float(self.scale))
+        sound = len(origin) == 3 and np.isfinite(origin).all() and 0 < self.scale < np.inf and self.hull in HULLS
+        if not (sound and self.friction >= 0 and self.torsion >= 0 and self.edges >= 3):
+            raise DexgraspError(
+                f"origin of 3 numbers, scale > 0, friction >= 0, torsion >= 0, edges >= 3, hull one of {HULLS}",
+                str(asdict(self)),
+                "mend the wrench model",
+            )
+
+    @classmethod
+    def from_dict(cls, fields: Mapping[str, Any]) -> "WrenchModel":
+        """Return the model that `as_dict` told."""
+        return cls(**fields)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return asdict(self) | {"origin": list(self.origin)}
+
+    @property
+    def per_contact(self) -> int:
+        """Wrenches of one contact."""
+        return len(cone_edges(self.edges, self.torsion > 0))
+
+    def wrenches(self, contacts: Array, normals: Array) -> Array:
+        """Return wrenches (N, F * per_contact, 6) of contacts (N, F, 3), m, with outward unit normals (N, F, 3)."""
+        return quality.wrenches(
+            contacts, normals, np.array(self.origin), self.scale, self.friction, self.edges, self.torsion
+        )
+
+    def epsilon(self, contacts: Array, normals: Array, threshold: float | None = None) -> "Quality":
+        """Return exact epsilon (N,) with this model; below a threshold it may be told as 0, which is faster."""
+        found = quality.epsilon(self.wrenches(contacts, normals), threshold, self._summed(contacts))
+        return Quality(found, self, "epsilon", threshold)
+
+    def reaches(self, contacts: Array, normals: Array, threshold: float) -> Array:
+        """Return whether epsilon >= threshold (N,): the fastest filter."""
+        return quality.reaches(self.wrenches(contacts, normals), threshold, self._summed(contacts))
+
+    def volume(self, contacts: Array, normals: Array) -> "Quality":
+        """Return the volume (N,) of the wrench hull with this model."""
+        return Quality(quality.volume(self.wrenches(contacts, normals), self._summed(contacts)), self, "volume")
+
+    def _summed(self, contacts: Array) -> int:
+        return contacts.shape[1] if self.hull == "linf" else 0
+
+
+@dataclass(frozen=True, eq=False)
+class Quality:
+    """Figures of grasps and what they are about."""
+
+    values: Array
+    """(N,)"""
+    model: WrenchModel
+    metric: Literal["epsilon", "volume"] = "epsilon"
+    threshold: float | None = None
+    """Values below it may be told as 0."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what stands beside stored values: metric, threshold and model, plain for JSON."""
+        return {"metric": self.metric, "threshold": self.threshold, "model": self.model.as_dict()}
