@@ -6,8 +6,10 @@ and the plane is thinned so that most points lie on things.
 
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 
@@ -98,11 +100,26 @@ def _near_standing(
 
     All of them where the plane is no table: where it is the top or a side of something, more lies behind it.
     """
-    step, thick = 0.005, 2 * framing.plane_distance
-    standing = heights > thick
-    if not standing.any() or (heights < -thick).mean() > 0.03 or not np.isfinite(framing.plane_margin):
+    thick = 2 * framing.plane_distance
+    if not np.isfinite(framing.plane_margin) or (heights < -thick).mean() > 0.03:
         return np.ones(len(heights), dtype=bool)
-    cells = np.floor((places - places.min(axis=0)) / step).astype(np.int64)
-    free = np.ones(cells.max(axis=0) + 1, dtype=bool)
-    free[tuple(cells[standing].T)] = False
-    return distance_transform_edt(free)[tuple(cells.T)] * step <= framing.plane_margin
+    cells, shape = _cells(places, 0.005)
+    free = np.ones(shape, dtype=bool)
+    free.ravel()[cells[heights > thick]] = False
+    if free.all():
+        return np.ones(len(heights), dtype=bool)
+    return (distance_transform_edt(free).ravel() * 0.005 <= framing.plane_margin)[cells]
+
+
+@numba.njit(cache=True)
+def _cells(places: NDArray, step: float) -> tuple[NDArray, tuple[int, int]]:
+    """Return in which square of a grid (row by row) each place lies, and the size of the grid."""
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for i in range(len(places)):
+        for k in range(2):
+            low[k], high[k] = min(low[k], places[i, k]), max(high[k], places[i, k])
+    rows, columns = int((high[0] - low[0]) / step) + 1, int((high[1] - low[1]) / step) + 1
+    cells = np.empty(len(places), np.int64)
+    for i in range(len(places)):
+        cells[i] = int((places[i, 0] - low[0]) / step) * columns + int((places[i, 1] - low[1]) / step)
+    return cells, (rows, columns)

@@ -92,7 +92,8 @@ def _fit_pixels(depth: NDArray, pixels: NDArray, fx: float, fy: float, cx: float
         sums[:] = 0.0
         count = 0
         for v in range(max(row - reach, 0), min(row + reach + 1, height)):
-            for u in range(max(column - reach, 0), min(column + reach + 1, width)):
+            side = int(math.sqrt(reach * reach - (v - row) * (v - row)))
+            for u in range(max(column - side, 0), min(column + side + 1, width)):
                 d = depth[v, u]
                 if d > 0:
                     a, b, c = (u - cx) / fx * d - x, (v - cy) / fy * d - y, d - z

@@ -55,14 +55,15 @@ def make_scene(dataset: Dataset, index: int) -> Item:
     settings = settings_of(dataset)
     scene = build_scene(objects, settings.clutter, _settler(config["simulator"]["settling"]), config["seed"], index)
     numbers = [objects.names.index(name) for name in scene.objects]
-    chosen, moved = [], [dataset.grasps(0)[:0].to(torch.float64)]
+    tried, chosen = [], []
     for row, number in enumerate(numbers):
         grasps = dataset.grasps(number)
         draw = stream(config["seed"], "scene grasps", index, row).permutation(len(grasps))[: settings.grasps_per_object]
         chosen.append(torch.from_numpy(draw))
-        world = grasps[chosen[-1]].to(torch.float64).moved(scene.poses[row])
-        moved.append(world.replace(object=torch.full((len(world),), row)))
-    grasps = Grasps.cat(moved)
+        pose, joints = scene.poses[row] @ grasps.pose[chosen[-1]].double(), grasps.joints[chosen[-1]].double()
+        world = Grasps.build(pose, joints, len(dataset.hand.fingers))
+        tried.append(world.replace(object=torch.full((len(draw),), row)))
+    grasps = Grasps.cat(tried)
     obstacles = [dataset.field(number) for number in numbers]
     free = feasible(dataset.shape, dataset.hand, grasps, scene.poses, obstacles, settings.approach, scene.fixtures)
     tensors = {

@@ -51,6 +51,7 @@ class MujocoSimulator(Simulator):
                 quiet = quiet + 1 if (world.speeds() * world.present < physics.rest_speed).all() else 0
                 if quiet >= looks:
                     break
+        self.at_rest = quiet >= looks
         final = world.poses()
         final[np.linalg.norm(final[:, :2, 3], axis=1) > physics.table_radius] = np.nan
         return torch.from_numpy(final).to(poses)

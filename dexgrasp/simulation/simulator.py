@@ -20,14 +20,17 @@ class Simulator(ABC):
     The same arguments give bitwise the same results.
     """
 
+    at_rest: bool = True
+    """Whether everything had come to rest when the last `settle` ended."""
+
     @abstractmethod
     def settle(
         self, objects: Sequence[Object], poses: Float[Tensor, "O 4 4"], seed: int, fixtures: Boxes | None = None
     ) -> Float[Tensor, "O 4 4"]:
         """Let go of the objects at `poses` (world_T_object, m) and return where they come to rest.
 
-        NaN for objects that were absent or left the table. `fixtures` stand fixed on it. `seed` is for engines that draw
-        random numbers.
+        NaN for objects that were absent or left the table. `fixtures` stand fixed on it. `seed` is for engines that
+        draw random numbers.
         """
 
     @abstractmethod
