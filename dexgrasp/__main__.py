@@ -23,8 +23,11 @@ TOOLS = {
 }
 """Ordinary arguments."""
 
-VERBS = {"dataset": ("inspect", "verify")}
+VERBS = {"dataset": ("inspect", "verify", "merge", "export", "card")}
 """First words that make a pipeline's command a tool: the module's `tool(arguments)` runs it."""
+
+PARTS = {("dataset", "estimate"): "estimate"}
+"""First words that make a pipeline's command another pipeline, with a config and a module of its own."""
 
 VALUED = "--cfg -c --package -p --config-path -cp --config-name -cn --config-dir -cd --experimental-rerun --info -i"
 """Hydra's flags whose value is the next word."""
@@ -42,6 +45,8 @@ def main(argv: list[str] | None = None) -> int:
             return int(import_module(f"dexgrasp.commands.{command}").main(rest) or 0)
         if rest[:1] and rest[0] in VERBS.get(command, ()):
             return int(import_module(f"dexgrasp.commands.{command}").tool(rest) or 0)
+        if (command, *rest[:1]) in PARTS:
+            return pipeline(PARTS[command, rest[0]], rest[1:])
         if command in PIPELINES:
             return tool(command, rest) if rest and rest[0].isidentifier() else pipeline(command, rest)
         from dexgrasp.registry import unknown

@@ -66,11 +66,8 @@ def load_folder(
     Raises DexgraspError where nothing usable is found.
     """
     root = Path(path).expanduser()
-    entries = find_meshes(root, layout, scale)
-    entries = [entry for entry in entries if _matches(entry.name, include) and not _matches(entry.name, exclude)]
-    if not entries:
-        raise DexgraspError(f"meshes under {root}", "none whose name is included", "change include and exclude")
-    jobs = (joblib.delayed(_load)(entry, repair, threshold) for entry in entries[:count])
+    entries = find_entries(path, layout, scale, include, exclude, count)
+    jobs = (joblib.delayed(_load)(entry, repair, threshold) for entry in entries)
     results: list[tuple[str, Object | None, str]] = list(
         joblib.Parallel(n_jobs=workers, initializer=end_with_parent)(jobs)
     )
@@ -88,6 +85,23 @@ def load_folder(
         listed = "; ".join(f"{name}: {reason}" for name, reason in skipped[:5])
         raise DexgraspError(f"a usable mesh under {root}", f"{len(skipped)} skipped ({listed})", "mend what is named")
     return objects, skipped
+
+
+def find_entries(
+    path: str,
+    layout: str = "auto",
+    scale: float | None = None,
+    include: str | Sequence[str] = "*",
+    exclude: str | Sequence[str] = (),
+    count: int | None = None,
+) -> list[Entry]:
+    """Return what `load_folder` would read with these options; raises DexgraspError where that is nothing."""
+    root = Path(path).expanduser()
+    entries = find_meshes(root, layout, scale)
+    entries = [entry for entry in entries if _matches(entry.name, include) and not _matches(entry.name, exclude)]
+    if not entries:
+        raise DexgraspError(f"meshes under {root}", "none whose name is included", "change include and exclude")
+    return entries[:count]
 
 
 def find_meshes(root: Path, layout: str = "auto", scale: float | None = None) -> list[Entry]:

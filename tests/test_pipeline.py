@@ -105,7 +105,7 @@ def test_found_again_and_independent_of_workers(made: tuple[DictConfig, Dataset]
 
 def test_settings_pick_the_stores(made: tuple[DictConfig, Dataset]) -> None:
     config = made[0]
-    plain, hand, told = (pipeline._plain(part) for part in (config.dataset, config.hand, config.repr))
+    plain, hand, told = (pipeline.plain(part) for part in (config.dataset, config.hand, config.repr))
 
     def hashes(**changes: object) -> list[str]:
         return [pipeline.digest(pipeline._content(s, plain | changes, hand, told)) for s in pipeline.STAGES]

@@ -89,6 +89,15 @@ class Dataset:
         write_whole(path, json.dumps(content, indent=1).encode())
         return path
 
+    def adopt(self, known: "Dataset") -> None:
+        """Take over from another dataset what is kept in memory and is the same in this one."""
+        if known.folders.get("objects") == self.folders.get("objects"):
+            self.field = known.field
+            if "objects" in vars(known):
+                self.objects = known.objects
+        if known.folders.get("grasps") == self.folders.get("grasps"):
+            self.grasps = known.grasps
+
     @lru_cache(8)  # noqa: B019  datasets live as long as the process
     def store(self, stage: str) -> Store:
         """Return the store of a stage."""
@@ -197,9 +206,17 @@ class Dataset:
         return {"train": range(first), "validation": range(first, len(self))}[name]
 
 
-@lru_cache(4)
+@lru_cache(1)
 def _opened(text: str) -> Dataset:
-    return Dataset(*json.loads(text))
+    dataset = Dataset(*json.loads(text))
+    for known in _last:
+        dataset.adopt(known)
+    _last[:] = [dataset]
+    return dataset
+
+
+_last: list[Dataset] = []
+"""What this process opened last: stages follow each other in it, and objects and grasps stay."""
 
 
 def open_dataset(path: str | Path) -> Dataset:

@@ -1,5 +1,6 @@
 """Values that are worth keeping, up to a number of bytes."""
 
+import time
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
@@ -23,12 +24,16 @@ class Kept(Generic[T]):
         self._values: OrderedDict[int, tuple[T, int]] = OrderedDict()
         self.bytes = 0
         """Of all values kept now."""
+        self.times: list[float] = []
+        """What each call of `make` took, s."""
 
     def __call__(self, key: int) -> T:
         if key in self._values:
             self._values.move_to_end(key)
             return self._values[key][0]
+        began = time.perf_counter()
         value = self.make(key)
+        self.times.append(time.perf_counter() - began)
         self._values[key] = value, size(value)
         self.bytes += size(value)
         while self.bytes > self.limit and len(self._values) > 1:

@@ -54,26 +54,37 @@ def ensure(
     wait, unless they have a `share` of several parts: those make it together. Raises DexgraspError for bad settings
     and damaged stores.
     """
-    settings, hand = _plain(config), _plain(hand)
-    told = None if representation is None else _plain(representation)
-    identity = _identity(hand, _check(settings, hand, told))
-    root = Path(settings["root"]).expanduser().absolute()
+    settings, hand = plain(config), plain(hand)
+    told = None if representation is None else plain(representation)
     folders: dict[str, Path] = {}
-    parent = ""
     with ExitStack() as stack:
         # Workers are started when there is something to make, once for all stages.
         chosen = settings["backend"], settings["workers"], settings.get("address")
         start = cache(lambda: stack.enter_context(workers.pool(*chosen)))
-        for stage in STAGES if told else STAGES[:-1]:
-            content = _content(stage, settings, identity, told) | {"after": parent, "revision": REVISION}
-            parent = digest(content)
-            folder = root / f"{stage}-{parent}"
-            work = _work(stage, content, Dataset(settings, hand, folders, told))
+        for stage, content, folder in plan(settings, hand, told):
+            work = work_of(stage, content, Dataset(settings, hand, folders, told))
             make_store(folder, work, settings["seed"], start, share or Share())
             folders[stage] = folder
     dataset = Dataset(settings, hand, folders, told)
-    dataset.save(root / f"dataset-{parent}.json")
+    dataset.save(folder.with_name(f"dataset-{folder.name.split('-')[-1]}.json"))
     return dataset
+
+
+def plan(
+    settings: dict[str, Any], hand: dict[str, Any], told: dict[str, Any] | None
+) -> list[tuple[str, dict[str, Any], Path]]:
+    """Return each stage of resolved configs, all that its content follows from, and its folder; makes nothing.
+
+    Raises DexgraspError for what is wrong in them.
+    """
+    identity = _identity(hand, _check(settings, hand, told))
+    root = Path(settings["root"]).expanduser().absolute()
+    found, parent = [], ""
+    for stage in STAGES if told else STAGES[:-1]:
+        content = _content(stage, settings, identity, told) | {"after": parent, "revision": REVISION}
+        parent = digest(content)
+        found.append((stage, content, root / f"{stage}-{parent}"))
+    return found
 
 
 def summary(dataset: Dataset) -> list[Made]:
@@ -146,7 +157,7 @@ def _listing(objects: dict[str, Any]) -> list[Any]:
     return [[str(path.relative_to(folder)), path.stat().st_size] for path in files]
 
 
-def _work(name: str, content: Mapping[str, Any], dataset: Dataset) -> Stage:
+def work_of(name: str, content: Mapping[str, Any], dataset: Dataset) -> Stage:
     """Return what a stage is made of, and what makes one item of it."""
     config = dataset.config
     if name == "objects":
@@ -169,7 +180,8 @@ def _objects(config: Mapping[str, Any]) -> list[tuple[int, Any]]:
     return list(enumerate(found))
 
 
-def _plain(config: Mapping[str, Any]) -> dict[str, Any]:
+def plain(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a config without interpolations; raises DexgraspError where a value is missing."""
     node = config if OmegaConf.is_config(config) else OmegaConf.create(dict(config))
     try:
         container = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
