@@ -32,7 +32,24 @@ def test_cmgnet_code_is_method_section_5() -> None:
     assert protocol.verdict.stop_at == 1
 
 
-@pytest.mark.parametrize("name", ["lift-v1", "cmgnet-code"])
+def test_bulk_is_lift_v1_in_longer_steps() -> None:
+    """The same hand, friction, masses and forces; what differs is how time is cut and how high it lifts."""
+    bulk, reference = load_protocol("lift-bulk-v1"), load_protocol("lift-v1")
+    differs = {
+        field.name
+        for group in ("physics", "motion", "verdict")
+        for field in dataclasses.fields(getattr(bulk, group))
+        if getattr(getattr(bulk, group), field.name) != getattr(getattr(reference, group), field.name)
+    }
+    assert differs == {"timestep", "contact_time", "leap", "lift", "lift_time", "rise", "alongside"}
+    for share in ("rise", "alongside"):
+        told = [getattr(p.verdict, share) / p.motion.lift for p in (bulk, reference)]
+        assert told[0] == pytest.approx(told[1], rel=0.01)
+    jerks = [p.motion.lift / p.motion.lift_time**2 for p in (bulk, reference)]
+    assert jerks[0] == pytest.approx(jerks[1], rel=0.01)
+
+
+@pytest.mark.parametrize("name", ["lift-v1", "lift-bulk-v1", "cmgnet-code"])
 def test_every_number_stands_in_the_yaml_and_old_configs_mean_the_same(name: str) -> None:
     config = yaml.safe_load((conf_folder() / "protocol" / f"{name}.yaml").read_text())
     protocol = load_protocol(config)
@@ -40,7 +57,7 @@ def test_every_number_stands_in_the_yaml_and_old_configs_mean_the_same(name: str
         fields = dataclasses.fields(getattr(protocol, group))
         assert list(config[group]) == [field.name for field in fields]
         for field in fields:
-            if field.default is not dataclasses.MISSING and field.name != "alongside":
+            if field.default is not dataclasses.MISSING and field.name not in ("alongside", "leap"):
                 assert config[group].pop(field.name) == field.default
     assert load_protocol(config) == protocol
 

@@ -1,5 +1,6 @@
 """One attempt: approach, close, squeeze, lift, hold, and the verdict on it."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -11,6 +12,15 @@ from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.simulation.world import World
 
 Array = NDArray[np.float64]
+
+SAMPLING = 0.002
+"""The way to a grasp is free if the hand touches nothing in places this far apart, m."""
+ANGLE, RUN_UP = 0.01, 0.06
+"""Closing is followed in steps of the one, and simulated from the other before anything is touched, rad or m."""
+CALM = 3
+"""So many looks go by after the lift until the pace of a held object is measured, over as many more."""
+AVERAGING = 0.2
+"""Weight of the newest measurement of that pace."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +54,12 @@ class Attempt:
         self.limits = world.hand.limits.numpy()  # type: ignore[union-attr]
         world.reset(poses)
         world.place_hand(plan.start_pose, plan.start_joints)
+        self.poses = poses
         self.initial = world.centres().copy()
         self.check = max(self._steps(protocol.verdict.look), 1)
         self.first = -1
         self.gripped = False
+        self.untouched = 0
         self.left = np.zeros(len(self.initial), dtype=bool)
 
     def run(self) -> Result:
@@ -60,24 +72,29 @@ class Attempt:
         self.gripped = bool(self.world.touched().any())
         if not self.gripped:
             return self._result(self._failure())
-        lost = self._lift()
+        lost = self._lift() or self._hold()
         return self._result(self._failure() if lost else self._verdict())
 
     def _approach(self) -> bool:
-        motion, verdict = self.protocol.motion, self.protocol.verdict
-        steps = self._steps(motion.approach_time)
-        for step in range(steps + self._steps(motion.arrival_time)):
-            share = min((step + 1) / steps, 1.0)
-            self.data.mocap_pos[0] = self.plan.start_pose[:3, 3] + share * (
-                self.plan.pose[:3, 3] - self.plan.start_pose[:3, 3]
-            )
-            # The fingers keep still: they close only when the palm has arrived.
-            mujoco.mj_step(self.model, self.data)
-            if step % self.check == 0:
-                self._look()
-                if self._displaced().max(initial=0.0) > verdict.displaced:
-                    return False
-        return bool(np.linalg.norm(self.world.base() - self.plan.pose[:3, 3]) <= verdict.blocked)
+        """Return whether the hand arrived; the fingers keep still, they close only when the palm has arrived.
+
+        A way on which the hand touches nothing is not simulated: the objects do on it what they do without a hand.
+        """
+        motion, limit = self.protocol.motion, self.protocol.verdict.displaced
+        steps, arrival = self._steps(motion.approach_time), self._steps(motion.arrival_time)
+        start, goal = self.plan.start_pose[:3, 3], self.plan.pose[:3, 3]
+        samples = max(int(np.ceil(np.linalg.norm(goal - start) / SAMPLING)), 1)
+        if self.world.passes(start + np.linspace(0, 1, samples + 1)[:, None] * (goal - start)):
+            moved = self.world.rest(self.poses, steps + arrival, self.check)
+            self.world.place_hand(self.plan.pose, self.plan.start_joints)
+            return bool(moved.max(initial=0.0) <= limit)
+        self.world.place_hand(self.plan.start_pose, self.plan.start_joints)
+        share = np.minimum(np.arange(1, steps + arrival + 1) / steps, 1.0)
+        for _ in self._carried(start + share[:, None] * (goal - start)):
+            self._look()
+            if self._displaced().max(initial=0.0) > limit:
+                return False
+        return bool(np.linalg.norm(self.world.base() - goal) <= self.protocol.verdict.blocked)
 
     def _close(self) -> None:
         """Close all fingers until they stall, then squeeze.
@@ -85,71 +102,119 @@ class Attempt:
         Fingers do not yield: as with a worm gear, a servo's goal never goes back, so that two fingers which push
         with the searching effort cannot drive back a third, which resists with all of its effort.
         """
-        motion, error = self.protocol.motion, self.protocol.physics.servo_error
-        lower, upper = self.limits.T
-        direction, closing = self.plan.direction, self.plan.direction != 0
-        way = self.plan.joints - self.plan.start_joints
-        steps = max(self._steps(float(np.abs(way).max(initial=0.0)) / motion.closing_speed), 1)
+        motion, error, world = self.protocol.motion, self.protocol.physics.servo_error, self.world
+        closing = np.flatnonzero(self.plan.direction)
+        direction = self.plan.direction[closing]
+        # Joints told so that all of them close upwards.
+        end = (direction[:, None] * self.limits[closing]).max(axis=1)
+        start, grasp = direction * self.plan.start_joints[closing], direction * self.plan.joints[closing]
+        steps = max(self._steps(float(np.abs(grasp - start).max(initial=0.0)) / motion.closing_speed), 1)
+        wanted = start + np.linspace(0, 1, steps + 1)[1:, None] * (grasp - start)
         beyond = np.inf if motion.overdrive is None else motion.overdrive
-        speed = motion.closing_speed * self.protocol.physics.timestep
-        lead = motion.closing_effort * error
-        goal = self.plan.start_joints.copy()
-        for step in range(steps + self._steps(motion.closing_time)):
-            if step < steps:
-                wanted = self.plan.start_joints + (step + 1) / steps * way
-            else:
-                wanted = self.plan.joints + direction * min((step + 1 - steps) * speed, beyond)
-            joints = self.data.qpos[self.world.driver_qpos]
-            ahead = np.minimum(direction * wanted, direction * joints + lead)
-            goal[closing] = (direction * np.maximum(direction * goal, ahead))[closing]
-            goal = np.clip(goal, lower, upper)
-            self.data.ctrl[:] = goal
-            mujoco.mj_step(self.model, self.data)
+        speed, lead = motion.closing_speed * self.protocol.physics.timestep, motion.closing_effort * error
+        drivers, rates = world.driver_qpos[closing], world.driver_qvel[closing]
+        begin = self._unhindered(wanted, closing, direction)
+        goal = start.copy() if begin == 0 else wanted[begin - 1].copy()
+        data, ctrl = self.data, self.data.ctrl
+        joints = direction * data.qpos[drivers]
+        for step in range(begin, steps + self._steps(motion.closing_time)):
+            aim = wanted[step] if step < steps else grasp + min((step + 1 - steps) * speed, beyond)
+            np.minimum(np.maximum(goal, np.minimum(aim, joints + lead), out=goal), end, out=goal)
+            ctrl[closing] = direction * goal
+            mujoco.mj_step(self.model, data)
+            joints = direction * data.qpos[drivers]
             if step % self.check == 0:
                 self._look()
-                joints = self.data.qpos[self.world.driver_qpos]
-                still = np.abs(self.data.qvel[self.world.driver_qvel]) < motion.stalled_speed
-                pushing = direction * (goal - joints) > motion.stalled_effort * lead
-                ended = np.where(direction > 0, goal >= upper, goal <= lower)
-                driven = (step + 1 - steps) * speed > beyond
-                if step >= steps and (driven or (still & (pushing | ended))[closing].all()):
+                stalled = np.abs(data.qvel[rates]) < motion.stalled_speed
+                stalled &= (goal - joints > motion.stalled_effort * lead) | (goal >= end)
+                if step >= steps and ((step + 1 - steps) * speed > beyond or stalled.all()):
                     break
         if motion.overdrive is not None:
             return
         steps = self._steps(motion.squeeze_time)
+        squeeze = (motion.grip_effort - motion.closing_effort) * error
         for step in range(steps):
-            squeeze = direction * (step + 1) / steps * (motion.grip_effort - motion.closing_effort) * error
-            self.data.ctrl[:] = np.clip(goal + squeeze, lower, upper)
-            mujoco.mj_step(self.model, self.data)
+            ctrl[closing] = direction * np.minimum(goal + (step + 1) / steps * squeeze, end)
+            mujoco.mj_step(self.model, data)
             if step % self.check == 0:
                 self._look()
 
+    def _unhindered(self, wanted: Array, closing: NDArray[np.intp], direction: Array) -> int:
+        """Put the hand where its fingers are still free to move and return that row of `wanted` (S, closing joints).
+
+        Fingers that touch nothing are not simulated; what they touch they reach at full speed.
+        """
+        ahead = self._steps(RUN_UP / self.protocol.motion.closing_speed)
+        joints = np.repeat(self.plan.start_joints[None], len(wanted), axis=0)
+        joints[:, closing] = direction * wanted
+        stride = max(self._steps(ANGLE / self.protocol.motion.closing_speed), 1)
+        free = self.world.free_way(self.plan.pose, joints[::stride]) * stride
+        begin = max(min(free, len(wanted)) - ahead, 0)
+        self.world.place_hand(self.plan.pose, joints[begin - 1] if begin else self.plan.start_joints)
+        return begin
+
     def _lift(self) -> bool:
         """Return True when the hand lost everything on the way."""
-        motion = self.protocol.motion
-        steps, total = self._steps(motion.lift_time), self._steps(motion.lift_time + motion.hold)
-        looks = max(round(self.protocol.verdict.lost / self.protocol.verdict.look), 1)
-        untouched = 0
-        for step in range(total):
-            share = min((step + 1) / steps, 1.0)
-            height = motion.lift * (0.5 - 0.5 * np.cos(np.pi * share))
-            self.data.mocap_pos[0, 2] = self.plan.pose[2, 3] + height
-            mujoco.mj_step(self.model, self.data)
-            if step % self.check == 0:
-                untouched = 0 if self._look() else untouched + 1
-                if untouched >= looks:
-                    return True
+        steps, lift = self._steps(self.protocol.motion.lift_time), self.protocol.motion.lift
+        path = np.repeat(self.plan.pose[None, :3, 3], steps, axis=0)
+        path[:, 2] += lift * (0.5 - 0.5 * np.cos(np.pi * np.arange(1, steps + 1) / steps))
+        return any(self._lost() for _ in self._carried(path))
+
+    def _hold(self) -> bool:
+        """Return True when the hand lost everything while it held still.
+
+        A held object drifts for long at a steady pace, because simulated friction creeps. Between two looks that pace,
+        where it is slow, is carried forward by `leap` at once (projective integration, Gear & Kevrekidis 2003); it is
+        an average, as what has moved too far swings back.
+        """
+        model, data, physics = self.model, self.data, self.protocol.physics
+        left, leap = self._steps(self.protocol.motion.hold), self._steps(physics.leap)
+        pace, now = np.zeros(model.nv), np.zeros(model.nv)
+        looks = -2 * CALM
+        while left > 0:
+            number = min(self.check, left)
+            first = number // 2
+            mujoco.mj_step(model, data, first)
+            if looks >= 0 or looks == -CALM:
+                before, since = data.qpos.copy(), data.time
+            mujoco.mj_step(model, data, number - first)
+            left, looks = left - number, looks + 1
+            if self._lost():
+                return True
+            if leap and looks >= 0 and left > 0:
+                mujoco.mj_differentiatePos(model, now, data.time - since, before, data.qpos)
+                now[self.world.base_qvel] = 0.0  # the base is led, it does not drift
+                pace += (now - pace) * (AVERAGING if looks else 1.0)
+                if max(np.abs(pace).max(), np.abs(now).max()) <= physics.leap_speed:
+                    mujoco.mj_integratePos(model, data.qpos, pace, min(leap, left) * physics.timestep)
+                    data.qvel[:] = pace
+                    left -= leap
         return False
+
+    def _lost(self) -> bool:
+        """Look; return whether the hand has touched nothing for as long as `lost` says."""
+        self.untouched = 0 if self._look() else self.untouched + 1
+        return self.untouched >= max(round(self.protocol.verdict.lost / self.protocol.verdict.look), 1)
+
+    def _carried(self, path: Array) -> Iterator[None]:
+        """Lead the wrist along `path` (S, 3), a place for each time step; stop whenever it is time to look."""
+        model, data, wrist = self.model, self.data, self.data.mocap_pos[0]
+        for step, place in enumerate(path):
+            wrist[:] = place
+            mujoco.mj_step(model, data)
+            if step % self.check == 0:
+                yield
 
     def _look(self) -> bool:
         """Note what is touched and what has left the table; return whether the hand touches anything."""
         touched = self.world.touched()
-        if self.first < 0 and touched.any():
+        some = bool(touched.any())
+        if some and self.first < 0:
             self.first = int(np.argmax(touched))
         risen = self._rise() > self.protocol.verdict.left
         if risen.any():
             self.left |= risen & ~self.world.on_table()
-        return bool(touched.any())
+        return some
 
     def _rise(self) -> Array:
         return self.world.centres()[:, 2] - self.initial[:, 2]

@@ -62,6 +62,10 @@ class Physics:
     """Longest time to come to rest, s."""
     rest_time: float = 0.2
     """Objects that were all slow for this long are at rest, s."""
+    leap: float = 0.0
+    """While the hand holds still, slow drift is carried forward by this time at once, s; 0: every step is made."""
+    leap_speed: float = 0.03
+    """Drift is slow where nothing moves faster than this, m/s and rad/s."""
 
 
 @dataclass(frozen=True)

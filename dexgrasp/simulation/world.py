@@ -1,6 +1,7 @@
 """A compiled MuJoCo world: table, objects and, where grasps are tried, a hand. State goes in and comes out by name."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -52,6 +53,7 @@ class World:
         self._owner[roots == 0] = TABLE
         for number, body in enumerate(self._bodies):
             self._owner[roots == body] = number
+        self._rest: tuple[Any, Array, Array, Array] | None = None
         self.present: NDArray[np.bool_] = np.ones(len(objects), dtype=bool)
         if hand is not None:
             names = [f"hand/{joint}" for joint in hand.joint_names]
@@ -60,6 +62,8 @@ class World:
             self.driver_qvel = np.array([self.model.joint(name).dofadr[0] for name in names])
             self._base = self.model.body(f"hand/{hand.tree[0].name}").id  # type: ignore[attr-defined]
             self._base_qpos = int(self.model.joint("hand").qposadr[0])
+            self.base_qvel = np.arange(6) + self.model.joint("hand").dofadr[0]
+            self._hand_qvel = np.flatnonzero(self.model.body_rootid[self.model.dof_bodyid] == self._base)
 
     def reset(self, poses: Array) -> None:
         """Put the objects at `poses` (O, 4, 4), world_T_object, at rest; NaN ones are taken away."""
@@ -82,10 +86,62 @@ class World:
         self.data.qpos[at : at + 3] = pose[:3, 3]
         self.data.qpos[at + 3 : at + 7] = quaternion(pose[:3, :3])
         self.data.qpos[self.full_qpos] = matrix @ joints + offset
+        self.data.qvel[self._hand_qvel] = 0.0
         self.data.mocap_pos[0] = pose[:3, 3]
         self.data.mocap_quat[0] = quaternion(pose[:3, :3])
         self.data.ctrl[:] = joints
         mujoco.mj_forward(self.model, self.data)
+
+    def passes(self, places: Array) -> bool:
+        """Tell whether the hand, as it stands now, touches nothing with its base at any of `places` (S, 3).
+
+        Moves nothing but the hand, which has to be placed again afterwards.
+        """
+        at = self._base_qpos
+        for place in places[::-1]:  # things are met at the end of the way first
+            self.data.qpos[at : at + 3] = place
+            if self._meets():
+                return False
+        return True
+
+    def free_way(self, pose: Array, joints: Array) -> int:
+        """Return with how many rows of `joints` (S, J), in order, a hand at `pose` (4, 4) touches nothing.
+
+        Moves nothing but the hand, which has to be placed again afterwards.
+        """
+        matrix, offset = (np.asarray(part) for part in self.hand.coupling)  # type: ignore[union-attr]
+        at = self._base_qpos
+        self.data.qpos[at : at + 3] = pose[:3, 3]
+        for row, full in enumerate(joints @ matrix.T + offset):
+            self.data.qpos[self.full_qpos] = full
+            if self._meets():
+                return row
+        return len(joints)
+
+    def _meets(self) -> bool:
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_collision(self.model, self.data)
+        return bool((self._pairs() == HAND).any())
+
+    def rest(self, poses: Array, steps: int, look: int) -> Array:
+        """Put the objects where they are `steps` after they were let go at `poses`, with no hand near.
+
+        Returns how far (O,) each centre had moved at most by then, m, looking every `look` steps.
+        """
+        key = (poses.tobytes(), steps, look)
+        if self._rest is None or self._rest[0] != key:
+            self.reset(poses)
+            away = np.eye(4)
+            away[2, 3] = 2 * ABSENT_HEIGHT
+            self.place_hand(away, self.hand.limits.mean(dim=1).numpy())  # type: ignore[union-attr]
+            initial, moved = self.centres().copy(), np.zeros(len(poses))
+            for step in range(0, steps, look):
+                mujoco.mj_step(self.model, self.data, min(look, steps - step))
+                moved = np.maximum(moved, np.linalg.norm(self.centres() - initial, axis=1))
+            self._rest = (key, moved * self.present, self.data.qpos.copy(), self.data.qvel.copy())
+        self.reset(poses)
+        _, moved, self.data.qpos[:], self.data.qvel[:] = self._rest
+        return moved
 
     def poses(self) -> Array:
         """Return world_T_object (O, 4, 4) of all objects; NaN where absent."""
@@ -123,19 +179,21 @@ class World:
 
     def intrusion(self) -> float:
         """Return how deep the hand is inside table or objects now, m."""
-        hands = (self._pairs() == HAND).any(axis=1)
-        depths = -self.data.contact.dist[hands]
-        return float(max(depths.max(initial=0.0), 0.0))
+        contact = self.data.contact
+        hands = (self._owner[contact.geom] == HAND).any(axis=1)
+        return float(max(-contact.dist[hands].min(initial=0.0), 0.0))
 
     def _touching(self, owner: int) -> NDArray[np.bool_]:
         result = np.zeros(len(self._bodies), dtype=bool)
-        pairs = self._pairs()[self.data.contact.dist <= 0]
+        pairs = self._pairs()
         others = pairs[(pairs == owner).any(axis=1)].max(axis=1)
         result[others[others >= 0]] = True
         return result
 
     def _pairs(self) -> NDArray[np.int64]:
-        return self._owner[self.data.contact.geom]
+        """Return (C, 2) whose geometries touch."""
+        contact = self.data.contact
+        return self._owner[contact.geom[contact.dist <= 0]]
 
 
 def _world(physics: Physics) -> mujoco.MjSpec:
