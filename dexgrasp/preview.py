@@ -10,15 +10,16 @@ import numpy as np
 import torch
 from numba import njit
 
-from dexgrasp.distance import DistanceField, Field, seed_at
+from dexgrasp.distance import DistanceField, Field
 from dexgrasp.hand import Hand
-from dexgrasp.hand_body import HandBody, carry, hand_body, place_link, place_links
-from dexgrasp.triangle_tree import nearest
+from dexgrasp.hand_body import HandBody, carry, hand_body, place_links
 
 COARSENESS = 8.0
 """The open hand is looked at with balls that follow it this much less closely than closing does."""
 NEAR = 5e-4
 """A fingertip touches where the grid says that it is this near, m."""
+HASTE = 1.5
+"""Steps are this much longer than the distance allows for certain: what is overshot is gone back."""
 STEPS = 64
 """Steps of a fingertip along its way, at most; those that slide along a surface are given up."""
 PROBES = 2048
@@ -119,6 +120,88 @@ def _buried(body: HandBody, field: Field, poses: np.ndarray, limit: float, stack
 
 
 @njit(cache=True)
+def _tip(body: HandBody, chain: np.ndarray, finger: int, full: np.ndarray, tip: np.ndarray) -> None:
+    """Write the fingertip centre in the frame of the first moving link's parent: a point needs no link poses."""
+    x, y, z = body.tips[finger, 0], body.tips[finger, 1], body.tips[finger, 2]
+    for c in range(len(chain) - 1, -1, -1):
+        if chain[c] < 0:
+            continue
+        motion = body.motions[chain[c]]
+        kind = int(motion[1])
+        if kind:
+            q, a, b, d = full[int(motion[2])], motion[3], motion[4], motion[5]
+            if kind == 1:
+                sine, cosine = math.sin(q), math.cos(q)
+                along = (1 - cosine) * (a * x + b * y + d * z)
+                x, y, z = (
+                    cosine * x + sine * (b * z - d * y) + along * a,
+                    cosine * y + sine * (d * x - a * z) + along * b,
+                    cosine * z + sine * (a * y - b * x) + along * d,
+                )
+            else:
+                x, y, z = x + q * a, y + q * b, z + q * d
+        x, y, z = (
+            motion[6] * x + motion[7] * y + motion[8] * z + motion[9],
+            motion[10] * x + motion[11] * y + motion[12] * z + motion[13],
+            motion[14] * x + motion[15] * y + motion[16] * z + motion[17],
+        )
+    tip[0], tip[1], tip[2] = x, y, z
+
+
+@njit(cache=True)
+def _trace(
+    body: HandBody,
+    field: Field,
+    chain: np.ndarray,
+    finger: int,
+    parent: np.ndarray,
+    rate: np.ndarray,
+    start: np.ndarray,
+    speed: float,
+    full: np.ndarray,
+    tip: np.ndarray,
+) -> bool:
+    """Move a fingertip until it touches; return whether it does. `full` and `tip` end there."""
+    end = 0.0
+    for m in range(len(rate)):
+        full[m] = start[m]
+        if rate[m] != 0:
+            bound = body.limits[m, 1] if rate[m] > 0 else body.limits[m, 0]
+            end = max(end, (bound - start[m]) / rate[m])
+    time = 0.0
+    for _ in range(STEPS):
+        _tip(body, chain, finger, full, tip)
+        x, y, z = tip
+        for k in range(3):
+            tip[k] = parent[k, 0] * x + parent[k, 1] * y + parent[k, 2] * z + parent[k, 3]
+        gap = interpolate(field, tip[0], tip[1], tip[2]) - body.tips[finger, 6]
+        if abs(gap) < NEAR:
+            return True
+        time += (HASTE if gap > 0 else 1.0) * gap / speed
+        if time > end or time < 0:
+            return False
+        for m in range(len(rate)):
+            if rate[m] != 0:
+                full[m] = min(max(start[m] + rate[m] * time, body.limits[m, 0]), body.limits[m, 1])
+    return False
+
+
+@njit(cache=True)
+def _foot(field: Field, at: np.ndarray, touch: np.ndarray) -> None:
+    """Write the surface point below `at` and its normal, as the grid's slope tells them."""
+    x, y, z = at
+    h = 0.5 * field.spacing
+    u = interpolate(field, x + h, y, z) - interpolate(field, x - h, y, z)
+    v = interpolate(field, x, y + h, z) - interpolate(field, x, y - h, z)
+    w = interpolate(field, x, y, z + h) - interpolate(field, x, y, z - h)
+    size = math.sqrt(u * u + v * v + w * w) + 1e-12
+    gap = interpolate(field, x, y, z)
+    touch[3], touch[4], touch[5] = u / size, v / size, w / size
+    for k in range(3):
+        touch[k] = at[k] - gap * touch[3 + k]
+
+
+@njit(cache=True)
 def _look(
     body: HandBody,
     field: Field,
@@ -131,9 +214,10 @@ def _look(
     count, fingers, movable = len(bases), len(body.tip_links), len(body.offset)
     status = np.zeros(count, np.int64)
     closed, touches = np.empty((count, movable)), np.full((count, fingers, 6), np.nan)
-    start, full, rate = np.empty(movable), np.empty(movable), np.empty(movable)
+    start, full = np.empty(movable), np.empty(movable)
+    rates = body.rates @ body.coupling.T
     poses = np.empty((len(body.parents), 3, 4))
-    stack, hit = np.empty(256, np.int64), np.empty(7)
+    stack, tips = np.empty(256, np.int64), np.empty((fingers, 3))
     for i in range(count):
         place_links(body, joints[i], bases[i], start, poses)
         closed[i] = start
@@ -141,36 +225,16 @@ def _look(
             status[i] = BURIED
             continue
         for finger in range(fingers):
-            end = 0.0
-            for m in range(movable):
-                rate[m] = 0.0
-                for j in range(joints.shape[1]):
-                    rate[m] += body.coupling[m, j] * body.rates[finger, j]
-                if rate[m] != 0:
-                    bound = body.limits[m, 1] if rate[m] > 0 else body.limits[m, 0]
-                    end = max(end, (bound - start[m]) / rate[m])
-            full[:] = start
-            time, near = 0.0, False
-            x, y, z = carry(poses, body.tip_links[finger], body.tips, finger)
-            for _ in range(STEPS):
-                gap = interpolate(field, x, y, z) - body.tips[finger, 6]
-                near = gap < NEAR
-                time += gap / speeds[finger]
-                if near or time > end:
-                    break
-                for m in range(movable):
-                    if rate[m] != 0:
-                        full[m] = min(max(start[m] + rate[m] * time, body.limits[m, 0]), body.limits[m, 1])
-                for c in range(chains.shape[1]):
-                    if chains[finger, c] >= 0:
-                        place_link(body.motions, chains[finger, c], full, bases[i], poses)
-                x, y, z = carry(poses, body.tip_links[finger], body.tips, finger)
-            if not near:
+            above = body.parents[chains[finger, 0]]
+            parent = poses[above] if above >= 0 else bases[i]
+            rate, chain = rates[finger], chains[finger]
+            if not _trace(body, field, chain, finger, parent, rate, start, speeds[finger], full, tips[finger]):
                 status[i] = MISSED
                 break
             for m in range(movable):
                 if rate[m] != 0:
                     closed[i, m] = full[m]
-            nearest(field.tree, x, y, z, seed_at(field, x, y, z), hit)
-            touches[i, finger] = hit[1:7]
+        if status[i] == SEEN:
+            for finger in range(fingers):
+                _foot(field, tips[finger], touches[i, finger])
     return status, closed, touches

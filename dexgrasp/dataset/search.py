@@ -20,7 +20,7 @@ from dexgrasp.hand_body import hand_body
 from dexgrasp.headroom import headroom
 from dexgrasp.objects import Object
 from dexgrasp.preview import BURIED, MISSED, SEEN, Preview
-from dexgrasp.quality import epsilon, wrenches
+from dexgrasp.wrench_model import WrenchModel
 
 PASS = 0.8
 """Hands are closed whose preview promises this much of the wanted epsilon."""
@@ -48,6 +48,7 @@ class Search:
     def __init__(self, hand: Hand, item: Object, surface: Surface, settings: SynthesisSettings) -> None:
         self.hand, self.item, self.surface, self.settings = hand, item, surface, settings
         self.body, self.shape, self.preview = hand_body(hand), HandShape(hand), Preview(hand)
+        self.model = WrenchModel(tuple(item.com), item.radius, settings.friction, settings.edges)
         share = settings.approach
         self.proposers = [
             (palm, proposer, part)
@@ -141,14 +142,16 @@ class Search:
         told = self._as_drawn(drawn[torch.from_numpy(seen)], touches[seen], ABOUT, ALIKE)
         self.rejected["touches elsewhere"] += int((~told).sum())
         seen = seen[told]
-        few = len(self.grasps) < FEW
-        least = PASS * settings.epsilon
-        enough = float(self.promise[-1]) if len(self.promise) == PROMISING else 0.0
-        quality = self._quality(touches[seen], min(least, enough) if few else least)
-        if few:
+        least, contacts, normals = PASS * settings.epsilon, touches[seen, :, :3], touches[seen, :, 3:]
+        if len(self.grasps) < FEW:
+            enough = float(self.promise[-1]) if len(self.promise) == PROMISING else 0.0
+            quality = np.asarray(self.model.epsilon(contacts, normals, min(least, enough)).values)
             self._promise(drawn[torch.from_numpy(seen)], torch.from_numpy(quality))
-        self.rejected["quality"] += int((quality < least).sum())
-        seen = seen[quality >= least]
+            good = quality >= least
+        else:
+            good = np.asarray(self.model.reaches(contacts, normals, least))
+        self.rejected["quality"] += int((~good).sum())
+        seen = seen[good]
         closed = torch.from_numpy(full[seen][:, self.body.leaders])
         free = self._above_table(pose[seen], [closed], self._sought).any(dim=1)
         self.rejected["under the table"] += int((~free).sum())
@@ -172,7 +175,7 @@ class Search:
         told = self._as_drawn(drawn[good], touches[good], HIT, PARALLEL)
         self.rejected["touches elsewhere"] += int((~told).sum())
         good = good[told]
-        quality = self._quality(touches[good], settings.epsilon)
+        quality = np.asarray(self.model.epsilon(touches[good, :, :3], touches[good, :, 3:], settings.epsilon).values)
         self.rejected["quality"] += int((quality < settings.epsilon).sum())
         good, quality = good[quality >= settings.epsilon], quality[quality >= settings.epsilon]
         contacts, normals = torch.from_numpy(touches[good]).split(3, dim=-1)
@@ -188,12 +191,6 @@ class Search:
         self.rejected["under the table"] += int((~folded & clear & ~fine).sum())
         self.valid += int(fine.sum())
         self._keep(grasps[fine], drawn[good][fine], free[fine])
-
-    def _quality(self, touches: Float[np.ndarray, "N F 6"], least: float | None) -> Float[np.ndarray, "N"]:
-        item, settings = self.item, self.settings
-        contacts, normals = touches[..., :3], touches[..., 3:]
-        cones = wrenches(contacts, normals, item.com, item.radius, settings.friction, settings.edges)
-        return np.asarray(epsilon(cones, least))
 
     def _above_table(
         self, pose: Float[Tensor, "N 4 4"], postures: list[Float[Tensor, "N J"]], which: Bool[Tensor, "K"] | None = None

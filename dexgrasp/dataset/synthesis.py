@@ -1,6 +1,7 @@
 """Objects become grasps: propose, look ahead, close, judge, thin (METHOD section 4)."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -44,6 +45,8 @@ class Summary:
     surface: float = 0.0
     directions: float = 0.0
     """What those kept reach, see `dexgrasp.dataset.spread.Coverage`."""
+    model: dict[str, Any] = field(default_factory=dict)
+    """What `quality` is about, see `dexgrasp.wrench_model.WrenchModel`; torque origin in the object's frame."""
     note: str = ""
     """Why there are none."""
 
@@ -77,6 +80,7 @@ def synthesize(hand: Hand, item: Object, settings: SynthesisSettings, seed: int)
         exact=exact,
         surface=reached.surface,
         directions=reached.directions,
+        model=search.model.as_dict(),
         note=search.note(),
     )
 
