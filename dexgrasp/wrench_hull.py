@@ -11,7 +11,18 @@ import numpy as np
 from numba import njit
 
 from dexgrasp.heap import pop, push
-from dexgrasp.wrench_support import DIM, ZERO, Vector, determinant, dot, random_words, row, simplex, simplex_normals, support
+from dexgrasp.wrench_support import (
+    DIM,
+    ZERO,
+    Vector,
+    determinant,
+    dot,
+    random_words,
+    row,
+    simplex,
+    simplex_normals,
+    support,
+)
 
 COPLANAR = 1e-11
 """Points this little above a facet's plane (wrenches of order 1) count as on it: the facet is final, bounds have met.

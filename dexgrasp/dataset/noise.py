@@ -62,20 +62,20 @@ class Noise:
         camera, shape = rendering.camera, rendering.depth.shape
         depth, instance, facet = rendering.depth, rendering.instance, rendering.facet
         if self.lateral > 0:
-            looked = _jitter(self.lateral * _fields(generator, 2, shape, self.grain), self.grain, shape)
-            depth, instance, facet = (image.ravel()[looked] for image in (depth, instance, facet))
+            rows, columns = (self.lateral * _field(generator, shape, self.grain) for _ in range(2))
+            depth, instance, facet = _jitter(rows, columns, depth, instance, facet)
         scale = 0.0 if self.baseline <= 0 else 1 / (self.baseline * (self.focal or camera.fx))
         lost = np.zeros(shape, dtype=bool)
         if self.baseline > 0:
             _shadow(depth, camera.fx * self.baseline, lost)
         count = generator.poisson(self.patches)
         _punch(lost, generator.uniform(0, 1, (count, 3)), self.patch_radius)
-        luck = generator.random((3, *shape), dtype=np.float32)
+        luck = generator.random((2, *shape), dtype=np.float32)
         white = generator.standard_normal(shape, dtype=np.float32)
-        grain, ripple = (
-            share * _fields(generator, 1, shape, length)[0] if share * scale > 0 else np.zeros((1, 1), np.float32)
-            for share, length in ((self.disparity, self.grain), (self.ripple, self.ripple_length))
-        )
+        slow = np.zeros((1, 1), np.float32)  # error of disparity; a single value is one for all pixels
+        for share, length in ((self.disparity, self.grain), (self.ripple, self.ripple_length)):
+            if share * scale > 0:
+                slow = slow + share * scale * _field(generator, shape, length)
         measured = _spoil(
             depth,
             facet,
@@ -84,41 +84,54 @@ class Noise:
             lost,
             luck,
             white,
-            (grain, self.grain),
-            (ripple, self.ripple_length),
-            (scale, self.sigma, self.proportional, self.clip, self.step * scale, self.quantum),
+            slow,
+            (self.sigma, self.proportional, self.clip, self.step * scale, self.quantum),
             (self.dropout, self.edge, self.edge_dropout, self.flying, np.cos(np.radians(self.grazing))),
         )
         return measured, instance
 
 
-def _fields(generator: np.random.Generator, count: int, shape: tuple[int, ...], length: float) -> NDArray:
-    """Return normal deviates at the nodes of a lattice over an image, `length` px wide."""
+def _field(generator: np.random.Generator, shape: tuple[int, int], length: float) -> NDArray:
+    """Return normal deviates (H W) that change over `length` px: between those at the nodes of a lattice."""
     rows, columns = (int(np.ceil(side / length)) + 2 for side in shape)
-    return generator.standard_normal((count, rows, columns), dtype=np.float32)
+    return _expand(generator.standard_normal((rows, columns), dtype=np.float32), length, shape)
 
 
 @numba.njit(cache=True)
-def _between(nodes: NDArray, length: float, v: int, u: int) -> float:
-    """Return what lies between the nodes of a lattice at a pixel, of the same variance everywhere."""
-    i, j = int(v / length), int(u / length)
-    s, t = v / length - i, u / length - j
-    near = (1 - t) * nodes[i, j] + t * nodes[i, j + 1]
-    far = (1 - t) * nodes[i + 1, j] + t * nodes[i + 1, j + 1]
-    return ((1 - s) * near + s * far) / np.sqrt(((1 - s) ** 2 + s * s) * ((1 - t) ** 2 + t * t))
-
-
-@numba.njit(cache=True)
-def _jitter(shifts: NDArray, length: float, shape: tuple[int, int]) -> NDArray:
-    """Return the pixel (row * W + column) at which each pixel looks."""
+def _expand(nodes: NDArray, length: float, shape: tuple[int, int]) -> NDArray:
+    """Interpolate linearly between nodes, with the same variance everywhere."""
     height, width = shape
-    looked = np.empty(shape, np.int64)
+    field, between = np.empty(shape, np.float32), np.empty(nodes.shape[1], np.float32)
+    left, right = np.empty(width, np.float32), np.empty(width, np.float32)
+    for u in range(width):
+        share = u / length - int(u / length)
+        norm = np.sqrt((1 - share) ** 2 + share * share)
+        left[u], right[u] = (1 - share) / norm, share / norm
+    for v in range(height):
+        row = int(v / length)
+        share = v / length - row
+        norm = np.sqrt((1 - share) ** 2 + share * share)
+        for k in range(len(between)):
+            between[k] = ((1 - share) * nodes[row, k] + share * nodes[row + 1, k]) / norm
+        for u in range(width):
+            k = int(u / length)
+            field[v, u] = left[u] * between[k] + right[u] * between[k + 1]
+    return field
+
+
+@numba.njit(cache=True)
+def _jitter(
+    rows: NDArray, columns: NDArray, depth: NDArray, instance: NDArray, facet: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return depth, instance and facet of where each pixel looks, shifted by so many px."""
+    height, width = rows.shape
+    z, owner, piece = np.empty_like(depth), np.empty_like(instance), np.empty_like(facet)
     for v in range(height):
         for u in range(width):
-            row = min(max(int(np.floor(v + 0.5 + _between(shifts[0], length, v, u))), 0), height - 1)
-            column = min(max(int(np.floor(u + 0.5 + _between(shifts[1], length, v, u))), 0), width - 1)
-            looked[v, u] = row * width + column
-    return looked
+            row = min(max(int(v + 1000.5 + rows[v, u]) - 1000, 0), height - 1)  # int() rounds towards 0
+            column = min(max(int(u + 1000.5 + columns[v, u]) - 1000, 0), width - 1)
+            z[v, u], owner[v, u], piece[v, u] = depth[row, column], instance[row, column], facet[row, column]
+    return z, owner, piece
 
 
 @numba.njit(cache=True)
@@ -170,12 +183,11 @@ def _spoil(
     lost: NDArray,
     luck: NDArray,
     white: NDArray,
-    grain: tuple[NDArray, float],
-    ripple: tuple[NDArray, float],
-    errors: tuple[float, float, float, float, float, float],
+    slow: NDArray,
+    errors: tuple[float, float, float, float, float],
     losses: tuple[float, float, float, float, float],
 ) -> NDArray:
-    scale, sigma, proportional, clip, step, quantum = errors
+    sigma, proportional, clip, step, quantum = errors
     dropout, edge, edge_dropout, flying, grazing = losses
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
@@ -197,16 +209,14 @@ def _spoil(
                     ends |= other <= 0
                     near, far = min(near, other if other > 0 else z), max(far, other)
             if far - near > edge or ends:
-                if luck[2, v, u] < edge_dropout:
+                if luck[0, v, u] < edge_dropout:
                     continue
-                share = (luck[2, v, u] - edge_dropout) / max(1 - edge_dropout, 1e-9)
+                share = (luck[0, v, u] - edge_dropout) / max(1 - edge_dropout, 1e-9)
                 if share < flying:
                     z = near + share / flying * (far - near)
             error = (sigma + proportional * z) * white[v, u]
-            if grain[0].size > 1:
-                error += scale * z * z * _between(grain[0], grain[1], v, u)
-            if ripple[0].size > 1:
-                error += scale * z * z * _between(ripple[0], ripple[1], v, u)
+            if slow.size > 1:
+                error += z * z * slow[v, u]
             z += min(max(error, -clip), clip)
             if step > 0 and z > 0:
                 z = 1 / (max(round(1 / (z * step)), 1) * step)
