@@ -139,6 +139,11 @@ class Store:
         return len(self._index)
 
     @property
+    def shards(self) -> list[Shard]:
+        """All shards that are known, in order."""
+        return [shard for _, shard in sorted(self._shards.items())]
+
+    @property
     def keys(self) -> list[str]:
         """Keys of all items, in the order of shards."""
         return list(self._index)

@@ -17,11 +17,11 @@ from dexgrasp.distance import DistanceField
 from dexgrasp.progress import track
 from dexgrasp.seeds import stream
 
-SHORTER = 16
+SHORTER = 4
 """The short search wants this much less and may take this many rounds less."""
 ROUNDS = 4
 """But not fewer rounds than this."""
-LOOKED_AT = 32
+LOOKED_AT = 16
 """Objects on which it is tried, at most."""
 
 
