@@ -151,6 +151,21 @@ class Dataset:
         """Return all grasps of object `index`, in its frame."""
         return Grasps(**self.store("grasps")[index].tensors)
 
+    def reasons(self, index: int) -> Int[Tensor, "N"]:
+        """Return what became in physics of each grasp of object `index`: a `Reason`, 0 where it lifted, -1 untested."""
+        found = torch.full((len(self.grasps(index)),), -1)
+        if "verdicts" in self.folders:
+            tensors = self.store("verdicts")[index].tensors
+            found[tensors["grasp"].long()] = tensors["reason"].long()
+        return found
+
+    def usable(self, index: int) -> Int[Tensor, "K"]:
+        """Return the grasps of object `index` of which scenes are made: all, or those that `verify.keep` names."""
+        verify, reasons = self.config.get("verify"), self.reasons(index)
+        keep = verify.get("keep", "lifted") if verify else "all"
+        chosen = {"lifted": reasons == 0, "tested": reasons >= 0, "all": reasons >= -1}[keep]
+        return chosen.nonzero().flatten()
+
     @property
     def scenes(self) -> int:
         """Number of scenes."""

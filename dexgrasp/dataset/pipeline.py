@@ -27,7 +27,7 @@ from dexgrasp.plugins import build_hand, build_representation, load_class
 
 REVISION = 4
 """Part of every hash; raised when code changes what the same settings give."""
-STAGES = ("objects", "grasps", "scenes", "views", "labels")
+STAGES = ("objects", "grasps", "verdicts", "scenes", "views", "labels")
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,10 @@ def plan(
     identity = _identity(hand, _check(settings, hand, told))
     root = Path(settings["root"]).expanduser().absolute()
     found, parent = [], ""
-    for stage in STAGES if told else STAGES[:-1]:
+    optional = {"verdicts": settings.get("verify"), "labels": told}
+    for stage in STAGES:
+        if not optional.get(stage, True):
+            continue
         content = _content(stage, settings, identity, told) | {"after": parent, "revision": REVISION}
         parent = digest(content)
         found.append((stage, content, root / f"{stage}-{parent}"))
@@ -125,8 +128,14 @@ def _content(
     if stage == "grasps":
         keys = ("synthesis", "approach", "seed")
         return {"hand": identity, **{key: settings[key] for key in keys}}
+    verify = stages.read_verify(settings)
+    if stage == "verdicts":
+        assert verify is not None
+        given = {key: settings[key] for key in ("approach", "seed")}
+        return {**verify.identity, "per_object": verify.per_object, **given}
     if stage == "scenes":
-        return {key: settings[key] for key in ("scenes", "approach", "simulator", "seed")}
+        taken = {} if verify is None else {"keep": verify.keep}
+        return {key: settings[key] for key in ("scenes", "approach", "simulator", "seed")} | taken
     if stage == "views":
         return {key: settings[key] for key in ("camera", "views", "seed")}
     assert told is not None
@@ -164,6 +173,8 @@ def work_of(name: str, content: Mapping[str, Any], dataset: Dataset) -> Stage:
         return Stage(name, content, lambda: _objects(config), stages.make_object, whole=True)
     if name == "grasps":
         return Stage(name, content, lambda: range(len(dataset.store("objects"))), partial(stages.make_grasps, dataset))
+    if name == "verdicts":
+        return Stage(name, content, lambda: range(len(dataset.store("grasps"))), partial(stages.make_verdicts, dataset))
     if name == "scenes":
         return Stage(name, content, lambda: range(config["scenes"]["count"]), partial(stages.make_scene, dataset))
     if name == "views":

@@ -19,15 +19,18 @@ from dexgrasp.dataset.shard import Item
 from dexgrasp.dataset.synthesis import synthesize
 from dexgrasp.dataset.synthesis_settings import SynthesisSettings
 from dexgrasp.dataset.truth import Truth, TruthSettings
+from dexgrasp.dataset.verdicts import VerifySettings, metrics, signature, tally, verify, verify_scene
 from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
 from dexgrasp.level import levelled
 from dexgrasp.objects import Object, object_to_tensors
 from dexgrasp.plugins import build_representation
+from dexgrasp.scene import Scene
 from dexgrasp.seeds import stream
 from dexgrasp.settings import read
 from dexgrasp.simulation.mujoco import MujocoSimulator
+from dexgrasp.simulation.protocol import load_protocol
 
 
 def key(index: int) -> str:
@@ -57,9 +60,9 @@ def make_scene(dataset: Dataset, index: int) -> Item:
     numbers = [objects.names.index(name) for name in scene.objects]
     tried, chosen = [], []
     for row, number in enumerate(numbers):
-        grasps = dataset.grasps(number)
-        draw = stream(config["seed"], "scene grasps", index, row).permutation(len(grasps))[: settings.grasps_per_object]
-        chosen.append(torch.from_numpy(draw))
+        grasps, usable = dataset.grasps(number), dataset.usable(number)
+        draw = stream(config["seed"], "scene grasps", index, row).permutation(len(usable))[: settings.grasps_per_object]
+        chosen.append(usable[torch.from_numpy(draw)])
         pose, joints = scene.poses[row] @ grasps.pose[chosen[-1]].double(), grasps.joints[chosen[-1]].double()
         world = Grasps.build(pose, joints, len(dataset.hand.fingers))
         tried.append(world.replace(object=torch.full((len(draw),), row)))
@@ -75,6 +78,33 @@ def make_scene(dataset: Dataset, index: int) -> Item:
         "fixture_halves": scene.fixtures.halves,
     }
     facts = {"objects": scene.objects, "seed": scene.seed, "grasps_tried": len(grasps), "grasps": int(free.sum())}
+    if settings.lift_tests:
+        found = _lifted(dataset, index, scene, grasps[free], numbers)
+        tensors, facts = {**tensors, **found.tensors}, facts | {"lift": found.facts}
+    return Item(key(index), tensors, facts)
+
+
+def _lifted(dataset: Dataset, index: int, scene: Scene, grasps: Grasps, numbers: list[int]) -> Item:
+    """Try some of a scene's feasible grasps in the scene itself."""
+    settings = settings_of(dataset)
+    draw = stream(dataset.config["seed"], "scene lift", index).permutation(len(grasps))[: settings.lift_tests]
+    rows, protocol = torch.from_numpy(draw), load_protocol(settings.lift_protocol)
+    objects = [dataset.objects[number] for number in numbers]
+    found = verify_scene(dataset.hand, objects, scene.poses, grasps[rows], protocol, scene.fixtures)
+    tensors = {"lift_row": rows.int(), "lift_reason": found.reason.to(torch.int8)}
+    return Item("", tensors, signature(protocol) | tally(found.reason))
+
+
+def make_verdicts(dataset: Dataset, index: int) -> Item:
+    """Lift-test grasps of object `index` where it stands alone on the table, and keep the metrics that they have."""
+    settings, item, grasps = settings_of(dataset), dataset.objects[index], dataset.grasps(index)
+    assert settings.verify is not None
+    rng = stream(dataset.config["seed"], "verdicts", item.name)
+    found = verify(dataset.hand, dataset.shape, item, grasps, settings.verify, settings.approach, rng)
+    synthesis = settings.synthesis
+    told = metrics(grasps[found.grasp], item, synthesis.friction, synthesis.edges)
+    tensors = found.tensors() | {f"metric_{name}": value.float() for name, value in told.items()}
+    facts = {"name": item.name, "grasps": len(grasps)} | signature(settings.verify.rules) | tally(found.reason)
     return Item(key(index), tensors, facts)
 
 
@@ -150,6 +180,9 @@ class Settings:
     clutter: Clutter
     scenes: int
     grasps_per_object: int
+    lift_tests: int
+    lift_protocol: str
+    verify: VerifySettings | None
     sensor: Sensor
     viewpoints: Viewpoints
     framing: Framing
@@ -162,9 +195,11 @@ class Settings:
         """Return the settings of a resolved config; raises DexgraspError for unknown or missing keys."""
         scenes, views, labels = dict(config["scenes"]), config["views"], config["labels"]
         count, per_object = scenes.pop("count"), scenes.pop("grasps_per_object")
+        lift_tests, lift_protocol = scenes.pop("lift_tests", 0), scenes.pop("lift_protocol", "lift-bulk-v1")
+        load_protocol(lift_protocol)
         fused = views.get("fused", 1)
         numbers = {"scenes.count": count, "scenes.grasps_per_object": per_object, "views.per_scene": views["per_scene"]}
-        numbers["views.fused"] = fused
+        numbers |= {"views.fused": fused, "scenes.lift_tests": lift_tests}
         for key, value in numbers.items():
             least = 1 if key in ("scenes.count", "views.fused") else 0
             if type(value) is not int or value < least:
@@ -175,6 +210,9 @@ class Settings:
             read(Clutter, scenes, "dataset.scenes"),
             count,
             per_object,
+            lift_tests,
+            lift_protocol,
+            read_verify(config),
             Sensor.build(config["camera"]),
             read(Viewpoints, views["viewpoints"], "dataset.views.viewpoints"),
             read(Framing, views["framing"], "dataset.views.framing"),
@@ -182,3 +220,8 @@ class Settings:
             read(LabelSettings, labels["points"], "dataset.labels.points"),
             read(TruthSettings, labels["truth"], "dataset.labels.truth"),
         )
+
+
+def read_verify(config: Mapping[str, Any]) -> VerifySettings | None:
+    """Return how grasps are verified by physics, None where they are not."""
+    return read(VerifySettings, config["verify"], "dataset.verify") if config.get("verify") else None
