@@ -1,13 +1,10 @@
-"""`dataset`: make the data of a config. `dataset inspect|verify PATH ...`: look into stores, or check every byte."""
+"""`dataset`: make the data of a config. `dataset inspect|verify|merge|export|card`: what one can do with it."""
 
+import argparse
 import json
-import logging
-import statistics
 import sys
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig
 
@@ -16,7 +13,6 @@ from dexgrasp.errors import DexgraspError
 
 SCHEMA = 1
 """Of results.json: {schema, command, stages: [{stage, items, bytes, seconds, folder}]}."""
-log = logging.getLogger(__name__)
 
 
 def main(config: DictConfig) -> None:
@@ -38,49 +34,122 @@ def main(config: DictConfig) -> None:
     stages = [{**vars(row), "folder": str(row.folder)} for row in rows]
     dataset.save(run / "dataset.json")
     (run / "results.json").write_text(json.dumps({"schema": SCHEMA, "command": "dataset", "stages": stages}, indent=1))
+    print(f"card: {dataset.card}")
     print(run)
 
 
 def tool(arguments: Sequence[str]) -> int:
-    """Run ``inspect`` or ``verify`` on stores, or on folders of stores; raises DexgraspError for a damaged one."""
-    usage = "python -m dexgrasp dataset inspect|verify PATH ..."
-    if len(arguments) < 2 or arguments[0] not in ("inspect", "verify"):
-        raise DexgraspError(usage, " ".join(arguments) or "nothing", "name one of the two and at least one path")
-    for folder in _stores(map(Path, arguments[1:])):
-        if arguments[0] == "verify":
-            shards = Store.open(folder).verify()
-            print(f"{folder}: {shards} shards are as they were written")
-        else:
-            print("\n".join(_description(Store.open(folder, complete=False))))
-    return 0
+    """Run one of the tools; raises DexgraspError for paths that hold no dataset and for damaged ones."""
+    options = _parser().parse_args(arguments)
+    return int(options.run(options) or 0)
 
 
-def _stores(paths: Iterator[Path]) -> Iterator[Path]:
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m dexgrasp dataset", description=__doc__)
+    tools = parser.add_subparsers(required=True, metavar="inspect|verify|merge|export|card")
+    where = "a dataset: its dataset.json, its run's folder, its root or the folder of one stage"
+
+    one = tools.add_parser("inspect", help="counts, distributions and pictures, of any stage")
+    one.add_argument("paths", nargs="+", type=Path, metavar="PATH", help=f"{where}, also one that is being made")
+    one.add_argument("--picture", type=Path, metavar="FILE", help="draw distributions, a scene and its view (PNG, PDF)")
+    one.add_argument("--scene", type=int, default=0, help="which scene is drawn (default 0)")
+    one.set_defaults(run=_inspect)
+
+    one = tools.add_parser("verify", help="checksums and schema of everything; grasps and scenes tested again")
+    one.add_argument("paths", nargs="+", type=Path, metavar="PATH", help=where)
+    one.add_argument("--grasps", type=int, default=500, help="grasps evaluated and closed again (default 500)")
+    one.add_argument("--scenes", type=int, default=10, help="scenes whose grasps are tested again (default 10)")
+    one.add_argument("--seed", type=int, default=0, help="of the draw of those")
+    one.set_defaults(run=_verify)
+
+    one = tools.add_parser("merge", help="join datasets of one hand and the same settings into one that trains")
+    one.add_argument("paths", nargs="+", type=Path, metavar="PATH", help=f"{where}; two or more")
+    one.add_argument("--to", type=Path, required=True, metavar="DIR", help="a new folder")
+    one.set_defaults(run=_merge)
+
+    one = tools.add_parser("export", help="write views as WebDataset, or grasps as Parquet")
+    one.add_argument("paths", nargs=1, type=Path, metavar="PATH", help=where)
+    one.add_argument("--format", required=True, choices=("webdataset", "parquet"))
+    one.add_argument("--to", type=Path, required=True, metavar="DIR", help="a new folder")
+    one.set_defaults(run=_export)
+
+    one = tools.add_parser("card", help="write the data card: counts, settings, cost, licence of every object")
+    one.add_argument("paths", nargs=1, type=Path, metavar="PATH", help=where)
+    one.add_argument("--to", type=Path, metavar="FILE", help="Markdown; default: beside the dataset's description")
+    one.set_defaults(run=_card)
+    return parser
+
+
+def _inspect(options: argparse.Namespace) -> None:
+    from dexgrasp.dataset.dataset import Dataset
+    from dexgrasp.dataset.inspection import description, figure
+
+    for folder in _stores(options.paths):
+        print("\n".join(description(Store.open(folder, complete=False))))
+    if options.picture is not None:
+        print(figure(Dataset.open(options.paths[0]), options.picture, options.scene))
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from dexgrasp.dataset.dataset import Dataset
+    from dexgrasp.dataset.verification import checked, rechecked
+
+    for folder in _stores(options.paths):
+        print(f"{folder}: {checked(Store.open(folder))}")
+    good = True
+    for path in options.paths:
+        try:
+            dataset = Dataset.open(path)
+        except DexgraspError as error:
+            print(f"{path}: no grasp is tested again: {error.expected}: {error.found}")
+            continue
+        for check in rechecked(dataset, options.grasps, options.scenes, options.seed):
+            good = good and check.good
+            print(check)
+    return 0 if good else 1
+
+
+def _merge(options: argparse.Namespace) -> None:
+    from dexgrasp.dataset.dataset import Dataset
+    from dexgrasp.dataset.merging import merge
+
+    print(merge([Dataset.open(path) for path in options.paths], options.to))
+
+
+def _export(options: argparse.Namespace) -> None:
+    from dexgrasp.dataset.dataset import Dataset
+
+    dataset = Dataset.open(options.paths[0])
+    if options.format == "webdataset":
+        from dexgrasp.dataset.webdataset_export import export_webdataset as export
+    else:
+        from dexgrasp.dataset.parquet_export import export_parquet as export
+    for path in export(dataset, options.to):
+        print(path)
+
+
+def _card(options: argparse.Namespace) -> None:
+    from dexgrasp.dataset.card import write_card
+    from dexgrasp.dataset.dataset import Dataset
+
+    dataset = Dataset.open(options.paths[0])
+    print(write_card(dataset, options.to or dataset.card))
+
+
+def _stores(paths: Sequence[Path]) -> Iterator[Path]:
+    """Yield the folders of all stores that the paths lead to."""
+    from dexgrasp.dataset.dataset import Dataset
+
     for path in paths:
         folder = path.parent if path.name == MANIFEST else path
-        found = [folder] if (folder / MANIFEST).exists() else sorted(p.parent for p in folder.glob(f"*/{MANIFEST}"))
+        if (folder / MANIFEST).exists():
+            yield folder
+            continue
+        found = sorted(p.parent for p in folder.glob(f"*/{MANIFEST}"))
         if not found:
-            raise DexgraspError(f"a store ({MANIFEST}) in {path}", "none", "give the folder that `dataset` printed")
+            try:
+                found = list(Dataset.open(path).folders.values())
+            except DexgraspError as cause:
+                remedy = "give the folder that `dataset` printed"
+                raise DexgraspError(f"a store ({MANIFEST}) or a dataset in {path}", "none", remedy) from cause
         yield from found
-
-
-def _description(store: Store) -> Iterator[str]:
-    manifest = store.manifest
-    state = "complete" if store.complete else f"{len(store.missing)} shards are missing"
-    yield f"{store.folder}: {manifest['kind']}, {len(store)} items in {manifest['expected_shards']} shards, {state}"
-    yield f"  seed {manifest['seed']}, schema {manifest['schema']}, settings {manifest['hash']}"
-    if len(store):
-        shapes = {name: (tuple(value.shape), str(value.dtype)[6:]) for name, value in store[0].tensors.items()}
-        yield "  first item: " + ", ".join(f"{name} {shape} {kind}" for name, (shape, kind) in shapes.items())
-    for name, values in _numbers(store.facts()).items():
-        low, middle, high = min(values), statistics.median(values), max(values)
-        yield f"  {name}: {low:g} .. {high:g}, median {middle:g}, sum {sum(values):g}"
-
-
-def _numbers(facts: Iterator[Mapping[str, Any]]) -> dict[str, list[float]]:
-    found: dict[str, list[float]] = defaultdict(list)
-    for item in facts:
-        for name, value in item.items():
-            if isinstance(value, int | float):
-                found[name].append(value)
-    return found

@@ -89,6 +89,12 @@ class Dataset:
         write_whole(path, json.dumps(content, indent=1).encode())
         return path
 
+    @property
+    def card(self) -> Path:
+        """Where the data card lies: beside the stages."""
+        last = list(self.folders.values())[-1]
+        return last.with_name(f"dataset-{last.name.rpartition('-')[2]}.md")
+
     def adopt(self, known: "Dataset") -> None:
         """Take over from another dataset what is kept in memory and is the same in this one."""
         if known.folders.get("objects") == self.folders.get("objects"):

@@ -49,6 +49,7 @@ def merge(datasets: Sequence[Dataset], folder: Path) -> Path:
     makers: dict[str, tuple[int, Callable[[int], Item]]] = {
         "objects": (len(items), lambda i: items[i]),
         "grasps": (len(items), lambda i: _grasps(sources, i)),
+        "verdicts": (len(items), lambda i: _verdicts(sources, i)),
         "scenes": (len(scenes), lambda i: _scene(sources[scenes[i][0]], scenes[i][1], i)),
         "views": (len(views), lambda i: _view(sources[views[i][0]].dataset, "views", views[i][1], i, per_scene)),
         "labels": (len(views), lambda i: _view(sources[views[i][0]].dataset, "labels", views[i][1], i, per_scene)),
@@ -142,16 +143,36 @@ def _scene_order(datasets: Sequence[Dataset]) -> tuple[list[tuple[int, int]], in
     return train + validation, len(train)
 
 
-def _grasps(sources: Sequence[Source], index: int) -> Item:
-    found = [
-        source.dataset.store("grasps")[number]
+def _parts(sources: Sequence[Source], stage: str, index: int) -> list[tuple[Item, int]]:
+    """Return what each dataset holds of a merged object, and which of its grasps theirs begin with."""
+    return [
+        (source.dataset.store(stage)[number], source.shifts[number])
         for source in sources
         for number, place in enumerate(source.objects)
         if place == index
     ]
+
+
+def _grasps(sources: Sequence[Source], index: int) -> Item:
+    found = [item for item, _ in _parts(sources, "grasps", index)]
     tensors = {name: torch.cat([item.tensors[name] for item in found]) for name in found[0].tensors}
     kept = sum(item.facts["kept"] for item in found)
     return Item(key(index), tensors, {**found[0].facts, "kept": kept})
+
+
+def _verdicts(sources: Sequence[Source], index: int) -> Item:
+    """Verdicts count in the object's grasps (`grasp`), and in poses at rest (`resting`), which are joined too."""
+    found, poses = _parts(sources, "verdicts", index), 0
+    parts: list[dict[str, Tensor]] = []
+    for item, shift in found:
+        moved = {"grasp": item.tensors["grasp"] + shift, "resting": item.tensors["resting"] + poses}
+        parts.append({**item.tensors, **moved})
+        poses += len(item.tensors["poses"])
+    facts = dict(found[0][0].facts)
+    for name, value in facts.items():
+        if type(value) is int:
+            facts[name] = sum(item.facts[name] for item, _ in found)
+    return Item(key(index), {name: torch.cat([part[name] for part in parts]) for name in parts[0]}, facts)
 
 
 def _scene(source: Source, scene: int, index: int) -> Item:

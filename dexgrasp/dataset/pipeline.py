@@ -17,6 +17,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from dexgrasp.dataset import stages, workers
+from dexgrasp.dataset.card import write_card
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.making import Share, Stage, make_store
 from dexgrasp.dataset.store import Store, digest
@@ -66,7 +67,9 @@ def ensure(
             make_store(folder, work, settings["seed"], start, share or Share())
             folders[stage] = folder
     dataset = Dataset(settings, hand, folders, told)
-    dataset.save(folder.with_name(f"dataset-{folder.name.split('-')[-1]}.json"))
+    dataset.save(dataset.card.with_suffix(".json"))
+    if not dataset.card.exists():
+        write_card(dataset, dataset.card)
     return dataset
 
 

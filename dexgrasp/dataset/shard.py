@@ -90,18 +90,18 @@ def append(tar: tarfile.TarFile, name: str, content: bytes) -> tuple[int, int]:
 def write_whole(path: Path, content: bytes | memoryview) -> None:
     """Write a file under a name of this process's own, sync it and rename it: under `path` it is whole or absent."""
     temporary = path.with_name(f".{path.name}.{socket.gethostname()}-{os.getpid()}.tmp")
-    try:
-        with room(f"{len(content)} bytes", path.parent):
+    with room(f"{len(content)} bytes", path.parent):
+        try:
             with open(temporary, "wb") as file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)  # the new name itself must survive a power cut
-    finally:
-        os.close(folder)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)  # the new name itself must survive a power cut
+        finally:
+            os.close(folder)

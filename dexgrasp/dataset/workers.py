@@ -90,7 +90,7 @@ def _ray() -> Any:
 def _dask_cluster(address: str | None, workers: int) -> Iterator[int]:
     distributed = _dask()
     if address:
-        client = _reached("Dask", address, lambda: distributed.Client(address, timeout="20s"))
+        client = _reached("Dask", address, lambda: distributed.Client(address, timeout="10s"))
     else:
         # One thread a process: what the processes share is the disk alone.
         client = distributed.Client(n_workers=workers, threads_per_worker=1, dashboard_address=None)
