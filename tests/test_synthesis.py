@@ -148,8 +148,8 @@ def surface(can):
 def test_surface_points_lie_on_the_surface_and_leave_nothing_out(surface, can):
     assert surface.field.distance(surface.points).abs().max() < 1e-9
     assert len(surface.points) > 2000  # a small object is sampled more finely than the spacing asks
-    anywhere = trimesh.sample.sample_surface(can.mesh, 500, seed=1)[0]
-    assert (surface.points[surface.nearest(torch.from_numpy(anywhere))] - anywhere).norm(dim=1).max() < 0.006
+    anywhere = torch.from_numpy(np.array(trimesh.sample.sample_surface(can.mesh, 500, seed=1)[0]))
+    assert (surface.points[surface.nearest(anywhere)] - anywhere).norm(dim=1).max() < 0.006
 
 
 def test_approach_looks_along_normals_with_open_fingers(hand, surface):

@@ -13,7 +13,7 @@ from dexgrasp.dataset.proposals import Approach, Contact, Draws
 from dexgrasp.dataset.spread import distinct, regions, spread
 from dexgrasp.dataset.surface import Surface
 from dexgrasp.dataset.synthesis_settings import SynthesisSettings
-from dexgrasp.execution import pregrasp
+from dexgrasp.execution import closing_direction, pregrasp
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.hand_body import hand_body
@@ -22,10 +22,12 @@ from dexgrasp.objects import Object
 from dexgrasp.preview import BURIED, MISSED, SEEN, Preview
 from dexgrasp.wrench_model import WrenchModel
 
-PASS = 0.8
-"""Hands are closed whose preview promises this much of the wanted epsilon."""
+PASS = 1.0
+"""Hands are closed whose preview promises this much of the wanted epsilon: closing is dear, and seldom finds more."""
+SLACK = 0.003
+"""In the preview hands may reach this much under the table, m."""
 FEW = 64
-"""While fewer grasps are known, the previews of best epsilon are varied beside them."""
+"""While fewer grasps are known that serve, the previews of best epsilon are varied beside them."""
 PROMISING = 256
 """So many of them."""
 YIELD = 0.15
@@ -57,6 +59,8 @@ class Search:
         ]
         self.rejected: Counter[str] = Counter()
         self.candidates = self.valid = 0
+        self.few = True
+        """Whether the best previews are varied, too."""
         self.step = 1.0
         """Of variations, as a part of their usual size."""
         self.best = 0.0
@@ -116,7 +120,8 @@ class Search:
         # What is common is found soon: search on where grasps are wanted, from those that serve there.
         serving = self.free[:, self._sought].any(dim=1)
         parents, region = self.draws[serving], regions(self.grasps[serving])
-        if len(parents) < FEW:
+        self.few = len(parents) < FEW
+        if self.few:
             parents = Draws.cat([parents, self.promising])
             region = np.arange(len(parents))
         for palm, proposer, share in self.proposers:
@@ -143,19 +148,26 @@ class Search:
         self.rejected["touches elsewhere"] += int((~told).sum())
         seen = seen[told]
         least, contacts, normals = PASS * settings.epsilon, touches[seen, :, :3], touches[seen, :, 3:]
-        if len(self.grasps) < FEW:
+        if self.few:
             enough = float(self.promise[-1]) if len(self.promise) == PROMISING else 0.0
-            quality = np.asarray(self.model.epsilon(contacts, normals, min(least, enough)).values)
-            self._promise(drawn[torch.from_numpy(seen)], torch.from_numpy(quality))
-            good = quality >= least
+            least = min(least, enough)
+            quality = np.asarray(self.model.epsilon(contacts, normals, least).values)
+            good = quality > least
         else:
+            quality = np.full(len(seen), least)
             good = np.asarray(self.model.reaches(contacts, normals, least))
         self.rejected["quality"] += int((~good).sum())
-        seen = seen[good]
+        seen, quality = seen[good], quality[good]
         closed = torch.from_numpy(full[seen][:, self.body.leaders])
-        free = self._above_table(pose[seen], [closed], self._sought).any(dim=1)
+        waiting = self.hand.clamp(closed - settings.opening * closing_direction(self.hand))
+        free = self._above_table(pose[seen], [closed, waiting], self._sought, SLACK).any(dim=1).numpy()
         self.rejected["under the table"] += int((~free).sum())
-        return torch.from_numpy(seen)[free]
+        seen, quality = seen[free], quality[free]
+        if self.few:
+            self._promise(drawn[torch.from_numpy(seen)], torch.from_numpy(quality))
+            self.rejected["quality"] += int((quality < PASS * settings.epsilon).sum())
+            seen = seen[quality >= PASS * settings.epsilon]
+        return torch.from_numpy(seen)
 
     def _promise(self, drawn: Draws, quality: Float[Tensor, "N"]) -> None:
         both, quality = Draws.cat([self.promising, drawn]), torch.cat([self.promise, quality])
@@ -193,14 +205,18 @@ class Search:
         self._keep(grasps[fine], drawn[good][fine], free[fine])
 
     def _above_table(
-        self, pose: Float[Tensor, "N 4 4"], postures: list[Float[Tensor, "N J"]], which: Bool[Tensor, "K"] | None = None
+        self,
+        pose: Float[Tensor, "N 4 4"],
+        postures: list[Float[Tensor, "N J"]],
+        which: Bool[Tensor, "K"] | None = None,
+        slack: float = 0.0,
     ) -> Bool[Tensor, "N K"]:
         """Tell in which of some (else all) resting poses of the object hands stay above the table in all postures."""
         poses = self.resting if which is None else self.resting[which]
         free = torch.ones(len(pose), len(poses), dtype=torch.bool)
         if self.settings.resting is not None:
             for joints in postures:
-                free &= headroom(self.shape, poses[:, 2], pose, joints, self.settings.table)
+                free &= headroom(self.shape, poses[:, 2], pose, joints, self.settings.table - slack)
         return free
 
     def _as_drawn(self, drawn: Draws, touches: Float[np.ndarray, "N F 6"], away: float, turned: float) -> np.ndarray:
