@@ -23,6 +23,13 @@ def planes(part: trimesh.Trimesh) -> np.ndarray:
     return np.column_stack([normals, offsets])[np.sort(first)]
 
 
+def inscribed(points: np.ndarray, normals: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """Return radii (N,) of the balls in a convex part that touch its surface from inside at points (N, 3), m."""
+    slack = np.maximum(sides[:, 3] - points @ sides[:, :3].T, 0) + PROTRUSION
+    slope = 1 - normals @ sides[:, :3].T
+    return np.where(slope > 1e-9, slack / np.maximum(slope, 1e-9), np.inf).min(axis=1)
+
+
 def inscribed_balls(parts: Sequence[trimesh.Trimesh], tolerance: float) -> np.ndarray:
     """Return balls (B, 4) of centre and radius (m) that fill the union of convex parts from inside its surface.
 
@@ -37,10 +44,7 @@ def inscribed_balls(parts: Sequence[trimesh.Trimesh], tolerance: float) -> np.nd
             if other != number:
                 buried |= (points @ body[:, :3].T - body[:, 3]).max(axis=1) < -1e-6
         points, normals = points[~buried], normals[~buried]
-        body = bodies[number]
-        slack = np.maximum(body[:, 3] - points @ body[:, :3].T, 0) + PROTRUSION
-        slope = 1 - normals @ body[:, :3].T
-        radius = np.where(slope > 1e-9, slack / np.maximum(slope, 1e-9), np.inf).min(axis=1)
+        radius = inscribed(points, normals, bodies[number])
         found.append(np.column_stack([points - radius[:, None] * normals, radius]))
         surface.append(points)
     balls, touched = np.concatenate(found), np.concatenate(surface)

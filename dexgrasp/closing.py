@@ -10,21 +10,25 @@ from torch import Tensor
 
 from dexgrasp.batch import Batch
 from dexgrasp.collision import as_arrays, deepest
-from dexgrasp.distal_contact import distal_contact, is_tip
-from dexgrasp.distance import DistanceField, Field, estimate, lower_bound, seed_at
+from dexgrasp.distal_contact import MOST, distal_contact, is_tip
+from dexgrasp.distance import DistanceField, Field, interpolated, quick_bound, seed_at
 from dexgrasp.hand import Hand
 from dexgrasp.hand_body import HandBody, carry, hand_body, place_link, place_links
-from dexgrasp.heap import push, replace
+from dexgrasp.patch_distance import SCRATCH, patch_distance
 from dexgrasp.triangle_tree import nearest
 
-TOUCH = 2e-5
+TOUCH = 4e-5
 """A finger touches where the gap is at most this, m."""
 NEAR = 0.5
 """A bounding ball is split once the surface is nearer than this many times what splitting may gain."""
-CLOSE = 1e-3
+CLOSE = 5e-4
 """Below this the grid's lower bound gives way to distances to triangles, m."""
-DOUBT = 5e-5
-"""Allowance for triangles that a cell does not name, m; nearer than twice this the exact distance decides."""
+EXACT = 6e-5
+"""Below this a lower bound of a distance to triangles gives way to the distance itself, m."""
+REACH = 1e-3
+"""Triangles farther than this from a link are not looked at, m."""
+AHEAD = 1.0
+"""What is due within this part of the last step is looked at early."""
 
 CLOSED, PENETRATES, MISSES, OFF_TIP = range(4)
 """How a closing ended. The last three are told only by `close_fingers` with `strict`."""
@@ -102,8 +106,8 @@ def close_fingers(
     depth = np.zeros(count)
     poses = np.empty((len(body.parents), 3, 4))
     rate, done = np.empty(len(body.offset)), np.zeros(fingers, np.bool_)
-    keys, nodes = np.empty(len(body.balls)), np.empty(len(body.balls), np.int64)
-    hit = np.empty(7)
+    due, nodes = np.empty(len(body.cover.balls)), np.empty(len(body.cover.balls), np.int64)
+    chain, work, hit, found = np.empty(len(body.parents), np.int64), np.empty(SCRATCH), np.empty(7), np.empty((MOST, 8))
     for i in range(count):
         place_links(body, joints[i], bases[i], full[i], poses)
         if strict and deepest(body, field, poses, -limit, True) < -limit:
@@ -117,26 +121,24 @@ def close_fingers(
                 rate[m] = 0.0
                 for j in range(joints.shape[1]):
                     rate[m] += body.coupling[m, j] * body.rates[finger, j]
-            ball = _advance(body, field, bases[i], finger, rate, full[i], poses, keys, nodes, hit)
-            while breakaway and ball >= 0 and body.ball_links[ball] != body.tip_links[finger]:
+            touched = _advance(body, field, bases[i], finger, rate, full[i], poses, due, nodes, chain, work, hit)
+            while breakaway and touched >= 0 and touched != body.tip_links[finger]:
                 # The link that touches and all above it stop; what lies beyond goes on.
-                link = body.ball_links[ball]
+                link = touched
                 while link >= 0:
                     if body.drives[link] >= 0:
                         rate[body.drives[link]] = 0.0
                     link = body.parents[link]
-                ball = _advance(body, field, bases[i], finger, rate, full[i], poses, keys, nodes, hit)
+                touched = _advance(body, field, bases[i], finger, rate, full[i], poses, due, nodes, chain, work, hit)
             for other in range(finger, fingers):
                 shared = other == finger
                 for j in range(joints.shape[1]):
                     shared |= body.rates[finger, j] != 0 and body.rates[other, j] != 0
-                if not shared or ball < 0:
+                if not shared or touched < 0:
                     continue
                 done[other] = True
-                link = body.ball_links[ball]
-                if other != finger or link == body.tip_links[finger]:
-                    link = body.tip_links[other]
-                    if not distal_contact(body, field, poses, other, nodes, hit):
+                if other != finger or touched == body.tip_links[finger]:
+                    if not distal_contact(body, field, poses, other, other == finger, nodes, found, hit):
                         continue
                     on_tip[i, other] = is_tip(body, poses, other, hit)
                 touches[i, other] = hit[1:7]
@@ -148,7 +150,7 @@ def close_fingers(
     return status, full, touches, on_tip, depth
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _advance(
     body: HandBody,
     field: Field,
@@ -157,77 +159,94 @@ def _advance(
     rate: np.ndarray,
     full: np.ndarray,
     poses: np.ndarray,
-    keys: np.ndarray,
+    due: np.ndarray,
     nodes: np.ndarray,
+    chain: np.ndarray,
+    work: np.ndarray,
     hit: np.ndarray,
 ) -> int:
-    """Move joints at `rate` from `full` until a ball touches; return it, or -1 at the limits.
+    """Move joints at `rate` from `full` until a link touches; return it, or -1 at the limits.
 
-    `full` and `poses` end at that posture; `hit` is the touch as `nearest` tells it. Every waiting node of the ball
-    trees holds the time before which it cannot touch: its distance over the largest speed of its centre.
+    `full` and `poses` end at that posture; `hit` is the touch: distance, point and normal. Every waiting node of the
+    covering trees holds the time before which nothing below it can touch: its distance over its largest speed.
     """
-    start = full.copy()
-    end = 0.0
+    cover, motions, limits, tree = body.cover, body.motions, body.limits, field.tree
+    balls, children, gains, owners = cover.balls, cover.children, cover.gains, cover.links
+    speeds, patch_speeds = cover.speeds[finger], cover.patch_speeds[finger]
+    start, end = full.copy(), 0.0
     for m in range(len(rate)):
         if rate[m] != 0:
-            limit = body.limits[m, 1] if rate[m] > 0 else body.limits[m, 0]
+            limit = limits[m, 1] if rate[m] > 0 else limits[m, 0]
             end = max(end, (limit - start[m]) / rate[m])
-    links = len(body.parents)
-    moving = np.zeros(links, np.bool_)
-    size = 0
-    for link in range(links):
-        parent = body.parents[link]
-        moving[link] = (parent >= 0 and moving[parent]) or (body.drives[link] >= 0 and rate[body.drives[link]] != 0)
-        if moving[link] and body.roots[link] >= 0:
-            size = push(keys, nodes, size, 0.0, body.roots[link])
-    placed = 0.0
+    moving, links, size = np.zeros(len(motions), np.bool_), 0, 0
+    for link in range(len(motions)):
+        parent, drive = int(motions[link, 0]), int(motions[link, 2])
+        moving[link] = (parent >= 0 and moving[parent]) or (drive >= 0 and rate[drive] != 0)
+        if moving[link]:
+            chain[links] = link
+            links += 1
+            if cover.roots[link] >= 0:
+                due[size], nodes[size] = 0.0, cover.roots[link]
+                size += 1
+    placed = time = 0.0
     while size:
-        time, node = keys[0], nodes[0]
-        if time > end:
-            break
+        horizon = time + AHEAD * (time - placed)  # what is due soon is looked at now: placing links costs more
         if time > placed:
-            _place(body, base, start, rate, time, moving, full, poses)
+            _place(motions, limits, base, chain[:links], start, rate, time, full, poses)
             placed = time
-        link = body.ball_links[node]
-        x, y, z = carry(poses, link, body.balls, node)
-        radius = body.balls[node, 3]
-        gap = lower_bound(field, x, y, z) - radius
-        left = body.children[node, 0]
-        if left >= 0:
-            if gap > NEAR * body.excess[node]:
-                size = replace(keys, nodes, size, time + gap / body.speeds[finger, node], node)
-            else:
-                size = replace(keys, nodes, size, time, left)
-                size = push(keys, nodes, size, time, body.children[node, 1])
-            continue
-        if gap < CLOSE:
-            about = estimate(field, x, y, z) - radius if gap + radius > 0 else 0.0
-            if about > 2 * DOUBT:
-                gap = max(gap, about - DOUBT)
-            else:
-                nearest(field.tree, x, y, z, seed_at(field, x, y, z), hit)
-                gap = hit[0] - radius
-                if gap <= TOUCH:
-                    return node
-        size = replace(keys, nodes, size, time + gap / body.speeds[finger, node], node)
-    _place(body, base, start, rate, end, moving, full, poses)
+        k, soonest = 0, np.inf
+        while k < size:
+            if due[k] > horizon:
+                soonest = min(soonest, due[k])
+                k += 1
+                continue
+            node = nodes[k]
+            link = owners[node]
+            x, y, z = carry(poses, link, balls, node)
+            gap = quick_bound(field, x, y, z) - balls[node, 3]
+            if children[node, 0] >= 0 and gap <= NEAR * gains[node]:
+                nodes[k], nodes[size], due[size] = children[node, 0], children[node, 1], time
+                size += 1
+                continue
+            wait = gap / speeds[node]
+            if gap < CLOSE and children[node, 0] < 0:
+                if time == 0 and interpolated(field, x, y, z) < field.spacing:
+                    nearest(tree, x, y, z, seed_at(field, x, y, z), hit)
+                    if hit[0] < 0:  # the link starts inside the object
+                        return link
+                work[7, 0, 0], work[7, 0, 1], work[7, 0, 2] = x, y, z
+                apart = patch_distance(
+                    body.shapes, tree, poses[link], cover.parts[node], balls[node, 3], EXACT, REACH, work, hit
+                )
+                if apart <= TOUCH:
+                    return link
+                wait = max(wait, apart / patch_speeds[node])
+            due[k] = time + wait
+            if due[k] <= end:
+                soonest = min(soonest, due[k])
+                k += 1
+            else:  # not on this way
+                size -= 1
+                due[k], nodes[k] = due[size], nodes[size]
+        time = soonest
+    _place(motions, limits, base, chain[:links], start, rate, end, full, poses)
     return -1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _place(
-    body: HandBody,
+    motions: np.ndarray,
+    limits: np.ndarray,
     base: np.ndarray,
+    chain: np.ndarray,
     start: np.ndarray,
     rate: np.ndarray,
     time: float,
-    moving: np.ndarray,
     full: np.ndarray,
     poses: np.ndarray,
 ) -> None:
     for m in range(len(full)):
         if rate[m] != 0:
-            full[m] = min(max(start[m] + rate[m] * time, body.limits[m, 0]), body.limits[m, 1])
-    for link in range(len(moving)):
-        if moving[link]:
-            place_link(body.motions, link, full, base, poses)
+            full[m] = min(max(start[m] + rate[m] * time, limits[m, 0]), limits[m, 1])
+    for k in range(len(chain)):
+        place_link(motions, chain[k], full, base, poses)

@@ -3,62 +3,83 @@
 import numpy as np
 from numba import njit
 
-from dexgrasp.distance import Field, lower_bound, seed_at
+from dexgrasp.distance import Field, interpolated, nearly, seed_at
 from dexgrasp.hand_body import HandBody, carry
 from dexgrasp.triangle_tree import nearest
 
 FLAT = 1e-4
-"""Balls within this of the surface at the moment of touch belong to the same contact, m."""
-GRID = 4e-3
-"""Twice what the grid's lower bound may lack, m."""
+"""Balls no farther from the surface than the nearest of them and this belong to the same contact, m."""
+BLUR = 3e-4
+"""What the grid's interpolation may be off near a surface, m."""
+NEAR = 5e-4
+"""Where a link touches, some ball is nearer than this to the surface, m."""
+MOST = 256
+"""Balls that are looked at."""
 TIE = 1e-12
 """Squared distances that differ by less are equal, m2."""
 TIP_REACH = 1.25
 """The rounded end reaches this many radii about the fingertip circle's centre, in the finger's side view."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def distal_contact(
-    body: HandBody, field: Field, poses: np.ndarray, finger: int, stack: np.ndarray, hit: np.ndarray
+    body: HandBody,
+    field: Field,
+    poses: np.ndarray,
+    finger: int,
+    touches: bool,
+    stack: np.ndarray,
+    found: np.ndarray,
+    hit: np.ndarray,
 ) -> bool:
     """Write to `hit` the one contact that stands for all of a distal link; return whether there is any.
 
     The fingertip circle where it touches; else, of all balls that lie on the surface, the one whose contact is
-    nearest to their mean (k-means with one centre, and its medoid).
+    nearest to their mean (k-means with one centre, and its medoid). With `touches` it is known that the link does.
+    `found` (MOST, 8) is scratch.
     """
     link = body.tip_links[finger]
     x, y, z = carry(poses, link, body.tips, finger)
     radius = body.tips[finger, 6]
-    if abs(lower_bound(field, x, y, z) - radius) < GRID:
+    if abs(interpolated(field, x, y, z) - radius) <= FLAT + BLUR:
         nearest(field.tree, x, y, z, seed_at(field, x, y, z), hit)
         if abs(hit[0] - radius) <= FLAT and _on_circle(body, poses, finger, hit):
             return True
-    found = np.empty((256, 7))
-    count, top = 0, 1
-    stack[0] = body.roots[link]
+    balls, children, first = body.balls, body.children, body.roots[link]
+    # Of distances the grid's will do to tell which balls lie on the surface.
+    count, top, least = 0, 1, NEAR if touches else 0.0
+    stack[0] = first
     while top and count < len(found):
         top -= 1
         node = stack[top]
-        x, y, z = carry(poses, link, body.balls, node)
-        radius = body.balls[node, 3]
-        if lower_bound(field, x, y, z) - radius > FLAT:
+        x, y, z = carry(poses, link, balls, node)
+        gap = interpolated(field, x, y, z)
+        if children[node, 0] >= 0:
+            if gap - balls[node, 3] <= least + FLAT + BLUR:
+                stack[top], stack[top + 1] = children[node, 0], children[node, 1]
+                top += 2
             continue
-        if body.children[node, 0] >= 0:
-            stack[top], stack[top + 1] = body.children[node, 0], body.children[node, 1]
-            top += 2
-            continue
-        nearest(field.tree, x, y, z, seed_at(field, x, y, z), found[count])
-        if found[count, 0] - radius <= FLAT:
+        gap -= balls[node, 3]
+        if gap <= least + FLAT:
+            found[count, 0], found[count, 1], found[count, 2], found[count, 3], found[count, 7] = gap, x, y, z, node
+            least = min(least, gap)
             count += 1
-    if count == 0:
-        return False
-    x, y, z = found[:count, 1].mean(), found[:count, 2].mean(), found[:count, 3].mean()
-    least, best = np.inf, 0
+    size, x, y, z = 0, 0.0, 0.0, 0.0
     for a in range(count):
+        if found[a, 0] <= least + FLAT:
+            found[size, 7] = found[a, 7]
+            nearly(field, found[a, 1], found[a, 2], found[a, 3], found[size])
+            x, y, z, size = x + found[size, 1], y + found[size, 2], z + found[size, 3], size + 1
+    if size == 0:
+        return False
+    x, y, z = x / size, y / size, z / size
+    nearest_square, best = np.inf, 0
+    for a in range(size):
         square = (found[a, 1] - x) ** 2 + (found[a, 2] - y) ** 2 + (found[a, 3] - z) ** 2
-        if square < least - TIE:  # of equals, the first: rounding must not choose between mirrored contacts
-            least, best = square, a
-    hit[:] = found[best]
+        if square < nearest_square - TIE:  # of equals, the first: rounding must not choose between mirrored contacts
+            nearest_square, best = square, a
+    x, y, z = carry(poses, link, balls, int(found[best, 7]))
+    nearest(field.tree, x, y, z, seed_at(field, x, y, z), hit)
     return True
 
 

@@ -10,7 +10,7 @@ from numba import njit
 
 from dexgrasp.errors import DexgraspError
 from dexgrasp.quality import Array
-from dexgrasp.triangle_tree import TriangleTree, nearest, to_triangle, triangle_tree
+from dexgrasp.triangle_tree import TriangleTree, nearest, to_box, to_triangle, triangle_tree
 
 STRIDE = 4
 """Grid nodes per coarse node: away from the surface, fine nodes are bounded from coarse ones."""
@@ -147,21 +147,35 @@ def lower_bound(field: Field, x: float, y: float, z: float) -> float:
     return best
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def quick_bound(field: Field, x: float, y: float, z: float) -> float:
-    """Return a lower bound of the signed distance at a point (m) from the one nearest grid node."""
+    """Return a lower bound of the signed distance at a point (m), from the nearest grid node alone."""
     h = field.spacing
     u, v, w = (x - field.origin[0]) / h, (y - field.origin[1]) / h, (z - field.origin[2]) / h
     nx, ny, nz = field.values.shape
     if u < 0 or v < 0 or w < 0 or u > nx - 1 or v > ny - 1 or w > nz - 1:
-        box = field.tree.boxes[0]
-        dx = max(box[0] - x, x - box[3], 0.0)
-        dy = max(box[1] - y, y - box[4], 0.0)
-        dz = max(box[2] - z, z - box[5], 0.0)
-        return math.sqrt(dx * dx + dy * dy + dz * dz)
+        return math.sqrt(to_box(field.tree.boxes, 0, x, y, z))
     i, j, k = int(u + 0.5), int(v + 0.5), int(w + 0.5)
     u, v, w = u - i, v - j, w - k
     return field.values[i, j, k] - h * math.sqrt(u * u + v * v + w * w)
+
+
+@njit(cache=True, error_model="numpy")
+def interpolated(field: Field, x: float, y: float, z: float) -> float:
+    """Return the signed distance at a point as the grid's eight nodes about it tell it: nearly right, no bound (m)."""
+    h = field.spacing
+    u, v, w = (x - field.origin[0]) / h, (y - field.origin[1]) / h, (z - field.origin[2]) / h
+    nx, ny, nz = field.values.shape
+    if u < 0 or v < 0 or w < 0 or u > nx - 1 or v > ny - 1 or w > nz - 1:
+        return math.sqrt(to_box(field.tree.boxes, 0, x, y, z))
+    i, j, k = min(int(u), nx - 2), min(int(v), ny - 2), min(int(w), nz - 2)
+    u, v, w = u - i, v - j, w - k
+    f = field.values
+    low = (1 - v) * ((1 - w) * f[i, j, k] + w * f[i, j, k + 1])
+    low += v * ((1 - w) * f[i, j + 1, k] + w * f[i, j + 1, k + 1])
+    high = (1 - v) * ((1 - w) * f[i + 1, j, k] + w * f[i + 1, j, k + 1])
+    high += v * ((1 - w) * f[i + 1, j + 1, k] + w * f[i + 1, j + 1, k + 1])
+    return (1 - u) * low + u * high
 
 
 @njit(cache=True)
@@ -175,23 +189,33 @@ def seed_at(field: Field, x: float, y: float, z: float) -> int:
     return field.seeds[i, j, k]
 
 
-@njit(cache=True)
-def estimate(field: Field, x: float, y: float, z: float) -> float:
-    """Return an upper bound of the unsigned distance at a point of the grid, mostly exact: its cell's triangles."""
-    h = field.spacing
+@njit(cache=True, error_model="numpy")
+def nearly(field: Field, x: float, y: float, z: float, out: np.ndarray) -> None:
+    """Write what `nearest` would, mostly exactly, from the triangles that the eight nodes about a point name.
+
+    The point lies outside the object, clear of its surface.
+    """
+    h, corners = field.spacing, field.tree.corners
     nx, ny, nz = field.values.shape
     i = min(max(int((x - field.origin[0]) / h), 0), nx - 2)
     j = min(max(int((y - field.origin[1]) / h), 0), ny - 2)
     k = min(max(int((z - field.origin[2]) / h), 0), nz - 2)
-    best, last, other = np.inf, -1, -1
+    best, last, other, v, w, triangle = np.inf, -1, -1, 0.0, 0.0, 0
     for a in range(2):
         for b in range(2):
             for c in range(2):
                 seed = field.seeds[i + a, j + b, k + c]
                 if seed != last and seed != other:
-                    best = min(best, to_triangle(field.tree.corners, seed, x, y, z)[0])
+                    square, v_t, w_t, _ = to_triangle(corners, seed, x, y, z)
+                    if square < best:
+                        best, v, w, triangle = square, v_t, w_t, seed
                     last, other = seed, last
-    return math.sqrt(best)
+    out[0] = math.sqrt(best)
+    point = (x, y, z)
+    for m in range(3):
+        a0 = corners[triangle, 0, m]
+        out[1 + m] = a0 + v * (corners[triangle, 1, m] - a0) + w * (corners[triangle, 2, m] - a0)
+        out[4 + m] = (point[m] - out[1 + m]) / max(out[0], 1e-300)
 
 
 @njit(cache=True)

@@ -6,6 +6,8 @@ import numpy as np
 from numba import njit
 
 from dexgrasp.ball_tree import ball_tree, inscribed_balls, planes
+from dexgrasp.convex_distance import Polytopes, polytopes
+from dexgrasp.cover import Cover, hand_cover
 from dexgrasp.errors import DexgraspError
 from dexgrasp.hand import Hand
 from dexgrasp.urdf import UrdfHand
@@ -14,8 +16,6 @@ TIP_TOLERANCE = 1e-4
 """How closely balls follow the distal links, m."""
 TOLERANCE = 3e-4
 """How closely balls follow all other links, m."""
-STILL = 1e-9
-"""Speed of balls that do not move, such as those centred on a joint's axis, m."""
 
 
 class HandBody(NamedTuple):
@@ -47,8 +47,6 @@ class HandBody(NamedTuple):
     """(B, 4) centre in the link's frame, radius."""
     children: np.ndarray
     """(B, 2); -1 for a leaf, whose ball touches the link's surface from inside."""
-    excess: np.ndarray
-    """(B,) by how much a ball exceeds the largest one below it: what splitting it may gain; 0 for a leaf."""
     ball_links: np.ndarray
     """(B,) the link of each ball."""
     roots: np.ndarray
@@ -67,8 +65,10 @@ class HandBody(NamedTuple):
     """(V,)."""
     rates: np.ndarray
     """(F, J) joint velocities that close each finger, per unit of its closing parameter."""
-    speeds: np.ndarray
-    """(F, B) bound of a ball centre's speed per unit of the closing parameter."""
+    cover: Cover
+    """Balls that hold the whole surface of the links that fingers move: what closing looks at."""
+    shapes: Polytopes
+    """The P convex parts again."""
     tip_links: np.ndarray
     """(F,) distal links."""
     tips: np.ndarray
@@ -112,7 +112,7 @@ def _compile(hand: UrdfHand, coarseness: float) -> HandBody:
     placements = np.ascontiguousarray([record.parent_T_joint[:3] for record in hand.tree])
     axes = np.array([record.axis for record in hand.tree])
     drives = np.array([record.index for record in hand.tree])
-    body = HandBody(
+    return HandBody(
         parents=parents,
         kinds=kinds,
         placements=placements,
@@ -126,7 +126,6 @@ def _compile(hand: UrdfHand, coarseness: float) -> HandBody:
         leaders=np.array([hand.full_joint_names.index(joint) for joint in hand.joint_names]),
         balls=np.concatenate(balls),
         children=np.concatenate(children),
-        excess=_excess(np.concatenate(balls), np.concatenate(children)),
         ball_links=np.concatenate(links),
         roots=roots,
         parts=np.cumsum([0, *map(len, sides)]),
@@ -136,51 +135,18 @@ def _compile(hand: UrdfHand, coarseness: float) -> HandBody:
         vertices=np.concatenate([part.vertices for _, part in bodies]),
         vertex_links=np.concatenate([np.full(len(part.vertices), link) for link, part in bodies]),
         rates=rates,
-        speeds=np.zeros((len(rates), count)),
+        cover=_cover(hand, limits, rates @ matrix.T),
+        shapes=polytopes([part for _, part in bodies]),
         tip_links=np.array([names.index(finger.link) for finger in hand.fingers]),
         tips=np.array([[*f.tip_center.tolist(), *f.closing_axis.tolist(), f.tip_radius] for f in hand.fingers]),
     )
-    for finger, rate in enumerate(rates @ matrix.T):
-        body.speeds[finger] = _speeds(body, rate, body.ball_links)
-    return body
 
 
-def _excess(balls: np.ndarray, children: np.ndarray) -> np.ndarray:
-    largest = balls[:, 3].copy()
-    for node in range(len(balls) - 1, -1, -1):  # children come after their parents
-        if children[node, 0] >= 0:
-            largest[node] = largest[children[node]].max()
-    return balls[:, 3] - largest
-
-
-def _speeds(body: HandBody, rate: np.ndarray, link_of: np.ndarray) -> np.ndarray:
-    """Bound each ball centre's speed while the full joints move at `rate`, whatever the posture."""
-    speeds = np.zeros(len(link_of))
-    for link in np.unique(link_of):
-        here = link_of == link
-        # Distances to the axis of the joint at hand: exact for the last one, bounded by the chain's lengths above it.
-        along, joint = body.balls[here, :3], link
-        reach = np.zeros(here.sum())
-        moved = False
-        while joint >= 0:
-            velocity = abs(rate[body.drives[joint]]) if body.drives[joint] >= 0 else 0.0
-            arm = reach if moved else np.linalg.norm(np.cross(along, body.axes[joint]), axis=1)
-            if body.kinds[joint] == 1:
-                speeds[here] += velocity * arm
-            elif body.kinds[joint] == 2:
-                speeds[here] += velocity
-            # Carry on to the parent's frame: exact while nothing has turned yet, else by lengths.
-            if not moved and body.kinds[joint] == 0:
-                along = along @ body.placements[joint, :, :3].T + body.placements[joint, :, 3]
-            else:
-                if not moved:
-                    reach = np.linalg.norm(along, axis=1)
-                    moved = True
-                if body.kinds[joint] == 2:
-                    reach = reach + np.abs(body.limits[body.drives[joint]]).max()
-                reach = reach + np.linalg.norm(body.placements[joint, :, 3])
-            joint = body.parents[joint]
-    return np.maximum(speeds, STILL)
+def _cover(hand: UrdfHand, limits: np.ndarray, rates: np.ndarray) -> Cover:
+    """Cover a hand's links; the result is kept with it."""
+    if "_cover" not in hand.__dict__:
+        hand.__dict__["_cover"] = hand_cover(hand.tree, hand.collisions, limits, rates)
+    return hand.__dict__["_cover"]
 
 
 @njit(cache=True, error_model="numpy")
