@@ -41,7 +41,7 @@ def test_bulk_is_lift_v1_in_longer_steps() -> None:
         for field in dataclasses.fields(getattr(bulk, group))
         if getattr(getattr(bulk, group), field.name) != getattr(getattr(reference, group), field.name)
     }
-    assert differs == {"timestep", "contact_time", "leap", "lift", "lift_time", "rise", "alongside"}
+    assert differs == {"timestep", "contact_time", "leap", "sleep", "lift", "lift_time", "rise", "alongside"}
     for share in ("rise", "alongside"):
         told = [getattr(p.verdict, share) / p.motion.lift for p in (bulk, reference)]
         assert told[0] == pytest.approx(told[1], rel=0.01)
@@ -57,7 +57,7 @@ def test_every_number_stands_in_the_yaml_and_old_configs_mean_the_same(name: str
         fields = dataclasses.fields(getattr(protocol, group))
         assert list(config[group]) == [field.name for field in fields]
         for field in fields:
-            if field.default is not dataclasses.MISSING and field.name not in ("alongside", "leap"):
+            if field.default is not dataclasses.MISSING and field.name not in ("alongside", "leap", "sleep"):
                 assert config[group].pop(field.name) == field.default
     assert load_protocol(config) == protocol
 

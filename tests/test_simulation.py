@@ -212,3 +212,57 @@ def test_tip_force_and_coupling_at_the_torque_limit(hand) -> None:
     inner, outer = (world.data.qpos[world.model.joint(f"hand/{name}").qposadr[0]] for name in names)
     assert outer / inner == pytest.approx(1 / 3, rel=0.01)
     assert world.intrusion() < 1e-3
+
+
+def test_drift_carried_forward_ends_like_every_step() -> None:
+    """A grip that creeps off, one that holds and one that cannot: leaps change neither verdict nor final height."""
+    hand, simulator = dexgrasp.load_hand("barrett"), MujocoSimulator()
+    grasps = from_above(0.195, 0.198, 0.201, 0.203, 0.205)
+    for friction in (0.6, 0.25):
+        protocols = [changed(physics={"friction": friction, "leap": leap}) for leap in (0.0, 0.1)]
+        slow, fast = (simulator.execute([CYLINDER], at((0, 0, 0.05)), hand, grasps, p) for p in protocols)
+        assert fast.reason.tolist() == slow.reason.tolist()
+        held = slow.success
+        torch.testing.assert_close(fast.height[held], slow.height[held], atol=2e-3, rtol=0)
+
+
+def test_a_free_way_is_not_simulated_and_an_obstructed_one_is(hand) -> None:
+    """Where nothing is touched the objects rest as they would have; where something is, it is pushed."""
+    world = World([BOX, BALL], hand, PROTOCOL.physics)
+    poses = at((0, 0, 0.03), (0.15, 0, 0.031)).numpy()
+    moved = world.rest(poses, 100, 10)
+    assert (moved > 0).all() and (moved < 2e-3).all()
+    before = world.poses()
+    world.rest(poses, 100, 10)
+    assert (world.poses() == before).all(), "the same again"
+    grasp = from_above(0.195)
+    world.place_hand(grasp.pose[0].numpy(), grasp.joints[0].numpy() - [0, 0.35, 0.35, 0.35])
+    above = np.linspace([0, 0, 0.3], [0, 0, 0.195], 20)
+    assert world.passes(above)
+    assert not world.passes(above - [0, 0, 0.1])
+    fingers = np.linspace(0.0, 2.4, 60)
+    joints = np.stack([np.zeros(60), fingers, fingers, fingers], axis=1)
+    free = world.free_way(grasp.pose[0].numpy(), joints)
+    assert 0 < free < 60 and 0.6 < fingers[free] < 1.3
+    world.place_hand(grasp.pose[0].numpy(), joints[free - 1])
+    assert not world.touched().any()
+    world.place_hand(grasp.pose[0].numpy(), joints[free])
+    assert world.touched().any()
+
+
+def test_objects_asleep_wake_when_they_are_touched(hand) -> None:
+    bulk = load_protocol("lift-bulk-v1")
+    poses = at((0, 0, 0.03), (0.3, 0, 0.03), (-0.3, 0, 0.05))
+    outcomes = MujocoSimulator(bulk).execute([BOX, BALL, CYLINDER], poses, hand, from_above(0.195, 0.45), bulk)
+    assert outcomes.reason.tolist() == [Reason.SUCCESS, Reason.MISSED] and int(outcomes.object[0]) == 0
+    torch.testing.assert_close(outcomes.final[0, 1:, :3, 3], poses[1:, :3, 3], atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("name", [n for n, case in CASES.items() if not case.groups])
+def test_bulk_tells_the_same_reasons(name, hand) -> None:
+    case, bulk = CASES[name], load_protocol("lift-bulk-v1")
+    things = [convex(trimesh.creation.box(t)) for t in case.things]
+    outcomes = MujocoSimulator(bulk).execute(
+        things, at(*case.places), hand, from_above(case.height, joints=case.joints), bulk
+    )
+    assert Reason(int(outcomes.reason[0])) is case.reason

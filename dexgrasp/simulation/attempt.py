@@ -60,6 +60,7 @@ class Attempt:
         self.first = -1
         self.gripped = False
         self.untouched = 0
+        self.calm = False
         self.left = np.zeros(len(self.initial), dtype=bool)
 
     def run(self) -> Result:
@@ -87,6 +88,8 @@ class Attempt:
         if self.world.passes(start + np.linspace(0, 1, samples + 1)[:, None] * (goal - start)):
             moved = self.world.rest(self.poses, steps + arrival, self.check)
             self.world.place_hand(self.plan.pose, self.plan.start_joints)
+            speeds = self.world.speeds()[self.world.present]
+            self.calm = bool((speeds < self.protocol.physics.rest_speed).all())
             return bool(moved.max(initial=0.0) <= limit)
         self.world.place_hand(self.plan.start_pose, self.plan.start_joints)
         share = np.minimum(np.arange(1, steps + arrival + 1) / steps, 1.0)
@@ -113,7 +116,7 @@ class Attempt:
         beyond = np.inf if motion.overdrive is None else motion.overdrive
         speed, lead = motion.closing_speed * self.protocol.physics.timestep, motion.closing_effort * error
         drivers, rates = world.driver_qpos[closing], world.driver_qvel[closing]
-        begin = self._unhindered(wanted, closing, direction)
+        begin = self._unhindered(wanted, closing, direction) if self.calm else 0
         goal = start.copy() if begin == 0 else wanted[begin - 1].copy()
         data, ctrl = self.data, self.data.ctrl
         joints = direction * data.qpos[drivers]
@@ -142,7 +145,7 @@ class Attempt:
     def _unhindered(self, wanted: Array, closing: NDArray[np.intp], direction: Array) -> int:
         """Put the hand where its fingers are still free to move and return that row of `wanted` (S, closing joints).
 
-        Fingers that touch nothing are not simulated; what they touch they reach at full speed.
+        While objects rest, fingers that touch nothing are not simulated; what they touch they reach at full speed.
         """
         ahead = self._steps(RUN_UP / self.protocol.motion.closing_speed)
         joints = np.repeat(self.plan.start_joints[None], len(wanted), axis=0)

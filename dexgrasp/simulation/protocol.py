@@ -66,6 +66,8 @@ class Physics:
     """While the hand holds still, slow drift is carried forward by this time at once, s; 0: every step is made."""
     leap_speed: float = 0.03
     """Drift is slow where nothing moves faster than this, m/s and rad/s."""
+    sleep: bool = False
+    """Whether objects at rest are left out of the computation until something touches them."""
 
 
 @dataclass(frozen=True)

@@ -203,6 +203,8 @@ def _world(physics: Physics) -> mujoco.MjSpec:
     spec.option.gravity = [0.0, 0.0, -physics.gravity]
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = physics.impratio
+    if physics.sleep:
+        spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     geom = spec.default.geom
     geom.condim = 4
