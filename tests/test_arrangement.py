@@ -5,14 +5,20 @@ import pytest
 import torch
 import trimesh
 
+from dexgrasp import load_hand
+from dexgrasp.collision import HandShape
 from dexgrasp.dataset.arrangement import Clutter, bin_walls, build_scene, pack, separation
 from dexgrasp.dataset.camera import TABLE, Camera, MeshScene
+from dexgrasp.dataset.clutter import Approach, feasible
+from dexgrasp.distance import DistanceField
 from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import look_at
-from dexgrasp.objects import ObjectSet, load_objects
-from dexgrasp.scene import Scene
+from dexgrasp.grasps import Grasps, Reason
+from dexgrasp.objects import Object, ObjectSet, load_objects
+from dexgrasp.scene import Boxes, Scene, no_boxes
 from dexgrasp.seeds import stream
 from dexgrasp.simulation.mujoco import MujocoSimulator
+from dexgrasp.simulation.protocol import load_protocol
 
 BIN = (0.3, 0.24, 0.08)
 
@@ -94,6 +100,27 @@ def test_walls_are_seen() -> None:
     assert higher.sum() > 100 and (walled.instance[higher] == TABLE).all()
     world = (camera.rays() * walled.depth.reshape(-1, 1)) @ pose[:3, :3].numpy().T + pose[:3, 3].numpy()
     assert world[:, 2].max() == pytest.approx(BIN[2], abs=1e-5)
+
+
+def test_walls_stop_the_hand() -> None:
+    """A grasp that lifts a box collides with a wall in its way, in physics and in the static check alike."""
+    hand, mesh = load_hand("barrett"), trimesh.creation.box((0.06, 0.06, 0.06))
+    item, pose = Object("box", "test", mesh, (mesh,)), torch.eye(4, dtype=torch.float64)[None].clone()
+    pose[0, 2, 3] = 0.03
+    base = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))[None]
+    base[0, 2, 3] = 0.195
+    grasp = Grasps.build(base, torch.tensor([[0.0, 1.0, 1.0, 1.0]], dtype=torch.float64), 3)
+    grasp = grasp.replace(object=torch.zeros(1, dtype=torch.long))
+    wall = torch.eye(4, dtype=torch.float64)[None].clone()
+    wall[0, :3, 3] = torch.tensor([0.0, -0.08, 0.05])
+    walls = Boxes(wall, torch.tensor([[0.1, 0.03, 0.05]], dtype=torch.float64))
+    simulator, protocol = MujocoSimulator(), load_protocol("lift-v1")
+    for fixtures, lifts in ((no_boxes(), True), (walls, False)):
+        outcome = simulator.execute([item], pose, hand, grasp, protocol, fixtures=fixtures)
+        assert bool(outcome.success[0]) == lifts
+        fields = [DistanceField.build(mesh)]
+        assert bool(feasible(HandShape(hand), hand, grasp, pose, fields, Approach(), fixtures)[0]) == lifts
+    assert outcome.reason.tolist() == [Reason.COLLIDED]
 
 
 def test_mixtures_are_drawn_by_weight(objects: ObjectSet) -> None:

@@ -45,7 +45,7 @@ class Clutter:
     """Places tried for an object before the square grows by a tenth."""
     reach: float = 0.20
     """Objects whose centre of mass comes to rest farther from the middle (along x or y) are taken away."""
-    pile: float = 0.04
+    pile: float = 0.025
     """Standard deviation of where objects are dropped on a pile."""
     bin: tuple[float, float, float] = (0.30, 0.24, 0.08)
     """Length, width and height of the inside of a bin; how it is turned is drawn."""

@@ -6,6 +6,7 @@ windows make neighbouring errors alike and edges ragged; time of flight mixes ne
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -70,9 +71,9 @@ class Noise:
             _shadow(depth, camera.fx * self.baseline, lost)
         count = generator.poisson(self.patches)
         _punch(lost, generator.uniform(0, 1, (count, 3)), self.patch_radius)
-        luck = generator.random((2, *shape), dtype=np.float32)
+        luck = np.frombuffer(generator.bytes(4 * depth.size), np.uint16).reshape(2, *shape)
         white = generator.standard_normal(shape, dtype=np.float32)
-        slow = np.zeros((1, 1), np.float32)  # error of disparity; a single value is one for all pixels
+        slow: NDArray[Any] = np.zeros((1, 1), np.float32)  # error of disparity; a single value is one for all pixels
         for share, length in ((self.disparity, self.grain), (self.ripple, self.ripple_length)):
             if share * scale > 0:
                 slow = slow + share * scale * _field(generator, shape, length)
@@ -194,12 +195,13 @@ def _spoil(
     measured = np.zeros(depth.shape, np.float32)
     for v in range(height):
         for u in range(width):
-            z = float(depth[v, u])
-            if z <= 0 or lost[v, u] or luck[0, v, u] < dropout:
+            z, chance = float(depth[v, u]), luck[0, v, u] / 65536
+            if z <= 0 or lost[v, u] or chance < dropout:
                 continue
             if grazing > 1e-9:
                 a, b, n = (u - cx) / fx, (v - cy) / fy, facets[facet[v, u]]
-                if luck[1, v, u] * grazing > abs(n[0] * a + n[1] * b + n[2]) / np.sqrt(a * a + b * b + 1):
+                cosine = abs(n[0] * a + n[1] * b + n[2]) / np.sqrt(a * a + b * b + 1)
+                if luck[1, v, u] / 65536 * grazing > cosine:
                     continue
             near = far = z
             ends = False  # what is out of range is beyond an edge, too
@@ -209,9 +211,9 @@ def _spoil(
                     ends |= other <= 0
                     near, far = min(near, other if other > 0 else z), max(far, other)
             if far - near > edge or ends:
-                if luck[0, v, u] < edge_dropout:
+                if chance < edge_dropout:
                     continue
-                share = (luck[0, v, u] - edge_dropout) / max(1 - edge_dropout, 1e-9)
+                share = (chance - edge_dropout) / max(1 - edge_dropout, 1e-9)
                 if share < flying:
                     z = near + share / flying * (far - near)
             error = (sigma + proportional * z) * white[v, u]

@@ -81,6 +81,7 @@ def _fit_neighbours(cloud: NDArray, rows: NDArray, neighbours: NDArray, eye: NDA
 @numba.njit(cache=True)
 def _fit_pixels(depth: NDArray, pixels: NDArray, fx: float, fy: float, cx: float, cy: float, radius: float) -> NDArray:
     height, width = depth.shape
+    inverse = 1 / fx
     normals = np.empty((len(pixels), 3))
     sums = np.empty(9)
     for i in range(len(pixels)):
@@ -89,17 +90,20 @@ def _fit_pixels(depth: NDArray, pixels: NDArray, fx: float, fy: float, cx: float
         x, y = (column - cx) / fx * z, (row - cy) / fy * z
         # About the longest reach in pixels: of a point that is nearer to the camera by the radius.
         reach = math.ceil(radius * max(fx, fy) / max(z - radius, 1e-3))
-        sums[:] = 0.0
-        count = 0
+        count, sx, sy, sz = 0, 0.0, 0.0, 0.0
+        xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for v in range(max(row - reach, 0), min(row + reach + 1, height)):
             side = int(math.sqrt(reach * reach - (v - row) * (v - row)))
+            slope = (v - cy) / fy
             for u in range(max(column - side, 0), min(column + side + 1, width)):
                 d = depth[v, u]
-                if d > 0:
-                    a, b, c = (u - cx) / fx * d - x, (v - cy) / fy * d - y, d - z
-                    if a * a + b * b + c * c <= radius * radius:
-                        _add(sums, a, b, c)
-                        count += 1
+                a, b, c = (u - cx) * inverse * d - x, slope * d - y, d - z
+                if d > 0 and a * a + b * b + c * c <= radius * radius:
+                    count += 1
+                    sx, sy, sz = sx + a, sy + b, sz + c
+                    xx, xy, xz = xx + a * a, xy + a * b, xz + a * c
+                    yy, yz, zz = yy + b * b, yz + b * c, zz + c * c
+        sums[:] = sx, sy, sz, xx, xy, xz, yy, yz, zz
         _plane(sums, count, -x, -y, -z, normals[i])
     return normals
 
