@@ -126,6 +126,7 @@ def test_golden_values_of_graspit(shared):
     for grasp in golden:
         sets = np.array([[wrench for contact in grasp["contacts"] for wrench in contact["wrenches"]]])
         expected = grasp["epsilon_L1"] if grasp["epsilon_L1"] > 1e-6 else 0.0
+        assert expected or epsilon(sets)[0] == 0
         differences.append(abs(epsilon(sets)[0] - expected))
     assert sum(g["epsilon_L1"] > 0 for g in golden) == 67
     differences = np.sort(differences)
