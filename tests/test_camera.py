@@ -154,6 +154,32 @@ def test_view_is_cropped_complete_and_repeatable() -> None:
     assert torch.rad2deg(torch.acos((outward * view.normals[ball]).sum(1).clamp(-1, 1))).median() < 5
 
 
+def test_views_fused_to_one_cloud() -> None:
+    """Several cameras see the ball from all sides; points lie in the first one's frame, normals look outward."""
+    meshes, poses = box_and_ball()
+    scene, framing = MeshScene(meshes, poses), Framing(points=4096, voxel=0.002)
+    places = [[0.4, -0.3, 0.4], [-0.5, 0.0, 0.3], [0.0, 0.45, 0.35]]
+    cameras = [look_at(torch.tensor(place), torch.tensor([-0.03, 0.0, 0.04])) for place in places]
+    behind = {}
+    for count in (1, 3):
+        view = capture(scene, cameras[:count], Sensor(CAMERA), framing, stream(0, "fused"))
+        assert len(view) == 4096 and torch.equal(view.world_T_camera, cameras[0].float())
+        ball = view.instance == 1
+        outward = view.points[ball] - (torch.linalg.inv(cameras[0]) @ poses[1])[:3, 3].float()
+        assert (outward.norm(dim=1) - 0.04).abs().max() < 3e-4
+        outward = torch.nn.functional.normalize(outward, dim=1)
+        assert torch.rad2deg(torch.acos((outward * view.normals[ball]).sum(1).clamp(-1, 1))).median() < 5
+        assert ((outward * view.normals[ball]).sum(1) > 0).float().mean() > 0.99
+        behind[count] = float(
+            (outward @ torch.nn.functional.normalize(view.points[ball].mean(0), dim=0) > 0.1).float().mean()
+        )
+    assert behind[1] < 0.02 and behind[3] > 0.25
+    cells = torch.floor(view.points.double() / framing.voxel)
+    assert len(cells.unique(dim=0)) > 0.98 * len(view.points.unique(dim=0)), "one point of a cube"
+    again = capture(scene, cameras, Sensor(CAMERA), framing, stream(0, "fused"))
+    assert torch.equal(view.points, again.points) and torch.equal(view.normals, again.normals)
+
+
 def test_plane_is_thinned_without_masks() -> None:
     meshes, poses = box_and_ball()
     pose = look_at(torch.tensor([0.3, -0.4, 0.5]), torch.tensor([0.0, 0.0, 0.03]))
