@@ -50,3 +50,14 @@ def roc_area(scores: Float[Tensor, "N"], truth: Bool[Tensor, "N"]) -> float | No
         return None
     ranks = rankdata(scores.detach().double().cpu().numpy())
     return float((ranks[truth.cpu().numpy()].sum() - wins * (wins + 1) / 2) / (wins * losses))
+
+
+def roc_curve(
+    scores: Float[Tensor, "N"], truth: Bool[Tensor, "N"]
+) -> tuple[Float[np.ndarray, "K"], Float[np.ndarray, "K"]]:
+    """Return the shares of false and of true ones that score at least each threshold, from none to all."""
+    values, inverse = np.unique(-scores.detach().double().cpu().numpy(), return_inverse=True)
+    good = truth.cpu().numpy()
+    counts = [np.bincount(inverse[part], minlength=len(values)).cumsum() for part in (~good, good)]
+    false, true = (np.r_[0.0, count / max(count[-1], 1)] if len(count) else np.zeros(1) for count in counts)
+    return false, true

@@ -35,6 +35,11 @@ def description(store: Store) -> Iterator[str]:
     for name, values in numbers.items():
         low, middle, high = min(values), statistics.median(values), max(values)
         yield f"  {name}: {low:g} .. {high:g}, median {middle:g}, sum {sum(values):g}"
+    if manifest["kind"] == "verdicts" and len(store):
+        from dexgrasp.dataset import verdicts
+
+        facts = store[0].facts
+        yield from (f"  {line}" for line in verdicts.summary(store, f"{facts['protocol']} {facts['protocol_hash']}"))
 
 
 def _numbers(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
@@ -70,12 +75,14 @@ def _panels(dataset: Dataset, scene: int) -> Iterator[Any]:
         yield lambda axes: _histogram(axes, pooled["quality"], "epsilon of the grasps", "grasps")
         yield lambda axes: _sorted_bars(axes, kept, f"{kept.sum():,} grasps of {len(kept)} objects", "grasps")
         for name in ("surface", "directions"):
-            reached = np.array([each["summary"].get(name, np.nan) for each in facts])
+            reached = np.array([each.get("summary", {}).get(name, np.nan) for each in facts])
             if np.isfinite(reached).any():
                 yield lambda axes, name=name, reached=reached: _histogram(
                     axes, reached, f"{name}: share reached", "objects", (0, 1)
                 )
         yield lambda axes: _joints(axes, pooled["joints"], dataset)
+    if "verdicts" in dataset.folders:
+        yield lambda axes: _roc(axes, dataset)
     if "scenes" in dataset.folders:
         free = np.array([each["grasps"] for each in dataset.store("scenes").facts()])
         yield lambda axes: _histogram(axes, free, f"feasible grasps of a scene, {free.sum():,} in all", "scenes")
@@ -115,6 +122,21 @@ def _joints(axes: Any, joints: np.ndarray, dataset: Dataset) -> None:
         counts, edges = np.histogram(values, bins=60)
         axes.plot(0.5 * (edges[1:] + edges[:-1]), counts, label=name, linewidth=1)
     axes.set_title("joints (rad; m where prismatic)", fontsize=9)
+    axes.legend(fontsize=6)
+
+
+def _roc(axes: Any, dataset: Dataset) -> None:
+    """How well metrics tell the grasps that lift in physics."""
+    from dexgrasp.dataset.verdicts import agreement
+
+    found, lifted = agreement(dataset.store("verdicts"))
+    for name, each in found.items():
+        if each.pooled is not None:
+            axes.plot(*each.curve, label=f"{name} {each.pooled:.2f}", linewidth=1)
+    axes.plot([0, 1], [0, 1], color="0.7", linewidth=0.5)
+    axes.set_title(f"{int(lifted.sum()):,} of {len(lifted):,} tested grasps lift; ROC and its area", fontsize=9)
+    axes.set_xlabel("share of those that do not lift", fontsize=8)
+    axes.set_ylabel("of those that do")
     axes.legend(fontsize=6)
 
 

@@ -19,7 +19,7 @@ from dexgrasp.dataset.shard import Item
 from dexgrasp.dataset.synthesis import synthesize
 from dexgrasp.dataset.synthesis_settings import SynthesisSettings
 from dexgrasp.dataset.truth import Truth, TruthSettings
-from dexgrasp.dataset.verdicts import VerifySettings, metrics, signature, tally, verify, verify_scene
+from dexgrasp.dataset.verdicts import METRIC, VerifySettings, metrics, signature, tally, verify, verify_scene
 from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
@@ -103,7 +103,7 @@ def make_verdicts(dataset: Dataset, index: int) -> Item:
     found = verify(dataset.hand, dataset.shape, item, grasps, settings.verify, settings.approach, rng)
     synthesis = settings.synthesis
     told = metrics(grasps[found.grasp], item, synthesis.friction, synthesis.edges)
-    tensors = found.tensors() | {f"metric_{name}": value.float() for name, value in told.items()}
+    tensors = found.tensors() | {METRIC + name: value.float() for name, value in told.items()}
     facts = {"name": item.name, "grasps": len(grasps)} | signature(settings.verify.rules) | tally(found.reason)
     return Item(key(index), tensors, facts)
 

@@ -1,7 +1,7 @@
 """Grasps verified by physics: which of an object's grasps lift it off the table, and how well metrics foretell it."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dexgrasp.collision import HandShape
 from dexgrasp.dataset.clutter import Approach, feasible
+from dexgrasp.dataset.shard import Item
 from dexgrasp.dataset.store import digest
 from dexgrasp.errors import DexgraspError
 from dexgrasp.grasps import Grasps, Outcomes, Reason
@@ -22,11 +23,13 @@ from dexgrasp.quality import epsilon, volume, wrenches
 from dexgrasp.scene import Boxes
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import Protocol, load_protocol
-from dexgrasp.statistics import roc_area
+from dexgrasp.statistics import roc_area, roc_curve, wilson
 
 UNTESTED = -1
 """In place of a `Reason` where a grasp was not tested."""
 KEEP = ("lifted", "tested", "all")
+METRIC = "metric_"
+"""Prefix of the names of metrics in a store."""
 SHARE, POSES = 0.95, 8
 """Resting poses that together are this likely, and at most so many, are those in which grasps are tested."""
 
@@ -173,6 +176,45 @@ def metrics(grasps: Grasps, item: Object, friction: float, edges: int) -> dict[s
     }
 
 
-def agreement(told: Mapping[str, Float[Tensor, "T"]], lifted: Bool[Tensor, "T"]) -> dict[str, float | None]:
-    """Return the area under the ROC of each metric as a sign that a grasp lifts; None where all are alike."""
-    return {name: roc_area(values, lifted) for name, values in told.items()}
+@dataclass(frozen=True)
+class Agreement:
+    """How well a metric tells grasps that lift from those that do not: areas under ROC curves."""
+
+    pooled: float | None
+    """Over all tested grasps; None where all end alike."""
+    within: float | None
+    """Mean over objects of which some grasps lift and some do not, weighted by the number of tests."""
+    curve: tuple[np.ndarray, np.ndarray]
+    """Shares of those that do not lift and of those that do, from the best score down."""
+
+
+def agreement(store: Iterable[Item]) -> tuple[dict[str, Agreement], Bool[Tensor, "T"]]:
+    """Return the agreement of each metric with the verdicts of a store, and which of its tested grasps lifted."""
+    items = [item.tensors for item in store]
+    lifted = [item["reason"] == int(Reason.SUCCESS) for item in items]
+    together = torch.cat(lifted) if lifted else torch.zeros(0, dtype=torch.bool)
+    found = {}
+    for name in [name for name in sorted(items[0] if items else ()) if name.startswith(METRIC)]:
+        scores = torch.cat([item[name] for item in items])
+        areas = [(roc_area(item[name], good), len(good)) for item, good in zip(items, lifted, strict=True)]
+        told = [(area, count) for area, count in areas if area is not None]
+        within = sum(area * count for area, count in told) / sum(count for _, count in told) if told else None
+        found[name.removeprefix(METRIC)] = Agreement(roc_area(scores, together), within, roc_curve(scores, together))
+    return found, together
+
+
+def summary(store: Iterable[Item], protocol: str) -> list[str]:
+    """Return the verdicts of a store in a few lines of text."""
+    found, lifted = agreement(store)
+    low, high = wilson(int(lifted.sum()), len(lifted))
+    share = f"{int(lifted.sum())} of {len(lifted)}, 95 % {low:.1%} .. {high:.1%}"
+    lines = [f"lifted by {protocol}: {lifted.double().mean():.1%} ({share})" if len(lifted) else "nothing was tested"]
+    if found and any(each.pooled is not None for each in found.values()):
+        lines.append("area under the ROC as a sign of lifting: pooled, within objects")
+        texts = {name: [_told(each.pooled), _told(each.within)] for name, each in found.items()}
+        lines += [f"  {name:14}{pooled:>7}{within:>7}" for name, (pooled, within) in texts.items()]
+    return lines
+
+
+def _told(area: float | None) -> str:
+    return "-" if area is None else f"{area:.3f}"

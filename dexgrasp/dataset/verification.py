@@ -28,6 +28,7 @@ SCHEMAS: dict[str, dict[str, tuple[str | int, ...]]] = {
         "object": ("n",),
         "quality": ("n",),
     },
+    "verdicts": {"grasp": ("t",), "reason": ("t",), "height": ("t",), "resting": ("t",), "poses": ("k", 4, 4)},
     "scenes": {"poses": ("o", 4, 4), "object": ("o",), "grasp_object": ("g",), "grasp": ("g",)},
     "views": {"points": ("p", 3), "normals": ("p", 3), "instance": ("p",), "world_T_camera": (4, 4)},
     "labels": {"point": ("k",), "finger": ("k",), "parameters": ("k", "p"), "quality": ("k",), "true": ("k",)},
