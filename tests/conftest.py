@@ -46,6 +46,48 @@ def toy_hand():
     return ToyHand()
 
 
+TINY = [
+    "dataset=smoke",
+    "dataset.objects.count=2",
+    "dataset.synthesis.target=100",
+    "dataset.synthesis.rounds=2",
+    "dataset.scenes.count=4",
+    "dataset.scenes.counts=[2]",
+    "dataset.views.framing.points=2048",
+]
+"""A dataset with one item a shard, so that several workers have work."""
+
+
+@pytest.fixture(scope="session")
+def tiny_overrides() -> list[str]:
+    """`TINY`."""
+    return TINY
+
+
+@pytest.fixture(scope="session")
+def composed():
+    """Composes the config of `dataset` with `TINY`, a root and further overrides."""
+    from hydra import compose, initialize_config_dir
+
+    from dexgrasp import config
+
+    def made(root: Path, *overrides: str):
+        config.register()
+        with initialize_config_dir(str(config.conf_folder()), version_base="1.3"):
+            return compose("dataset", overrides=[*TINY, f"dataset.root={root}", *overrides])
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory, composed):
+    """Config and dataset of `TINY`, made by one process. Look, do not touch."""
+    from dexgrasp.dataset.pipeline import ensure
+
+    config = composed(tmp_path_factory.mktemp("tiny"), "dataset.workers=1")
+    return config, ensure(config.dataset, config.hand, config.repr)
+
+
 class ToyHand(Hand):
     """Fingers stand at radius 5 cm about z and bend towards it; analytic kinematics."""
 

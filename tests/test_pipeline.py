@@ -7,15 +7,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, open_dict
 
-from dexgrasp import config as settings
 from dexgrasp.commands.dataset import tool
 from dexgrasp.dataset import pipeline
 from dexgrasp.dataset.dataset import Dataset
@@ -24,34 +22,17 @@ from dexgrasp.dataset.store import Store
 from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import inverse
 
-TINY = [
-    "dataset=smoke",
-    "dataset.objects.count=2",
-    "dataset.synthesis.target=100",
-    "dataset.synthesis.rounds=2",
-    "dataset.scenes.count=4",
-    "dataset.scenes.counts=[2]",
-    "dataset.views.framing.points=2048",
-]
-"""One shard an item, so that several workers have work."""
-MADE = [stage for stage in pipeline.STAGES if stage != "verdicts"]
-"""Stages of a dataset whose grasps are not verified."""
-
-
-def composed(root: Path, *overrides: str) -> DictConfig:
-    settings.register()
-    with initialize_config_dir(str(settings.conf_folder()), version_base="1.3"):
-        return compose("dataset", overrides=[*TINY, f"dataset.root={root}", *overrides])
+Composed = Callable[..., DictConfig]
+Made = tuple[DictConfig, Dataset]
 
 
 def make(config: DictConfig) -> Dataset:
     return ensure(config.dataset, config.hand, config.repr)
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[DictConfig, Dataset]:
-    config = composed(tmp_path_factory.mktemp("data"), "dataset.workers=1")
-    return config, make(config)
+@pytest.fixture
+def made(tiny: tuple[DictConfig, Dataset]) -> tuple[DictConfig, Dataset]:
+    return tiny
 
 
 @pytest.fixture
@@ -96,7 +77,9 @@ def test_flow_is_consistent(made: tuple[DictConfig, Dataset]) -> None:
         assert len(targets) == 2048
 
 
-def test_found_again_and_independent_of_workers(made: tuple[DictConfig, Dataset], tmp_path: Path) -> None:
+def test_found_again_and_independent_of_workers(
+    made: tuple[DictConfig, Dataset], tmp_path: Path, composed: Composed
+) -> None:
     config, dataset = made
     before = {path: path.stat().st_mtime_ns for path in Path(config.dataset.root).rglob("*.tar")}
     assert make(config).folders == dataset.folders
@@ -169,7 +152,7 @@ def test_summary(made: tuple[DictConfig, Dataset]) -> None:
     assert str(made[1].folders["views"]) in table(rows)
 
 
-def test_bad_settings_leave_no_trace(tmp_path: Path) -> None:
+def test_bad_settings_leave_no_trace(tmp_path: Path, composed: Composed) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
     config = composed(tmp_path / "data")
@@ -184,8 +167,10 @@ def test_bad_settings_leave_no_trace(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_interrupt_leaves_whole_shards_and_is_taken_up(made: tuple[DictConfig, Dataset], tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "dexgrasp", "dataset", *TINY, f"dataset.root={tmp_path / 'data'}"]
+def test_interrupt_leaves_whole_shards_and_is_taken_up(
+    made: tuple[DictConfig, Dataset], tmp_path: Path, composed: Composed, tiny_overrides: list[str]
+) -> None:
+    command = [sys.executable, "-m", "dexgrasp", "dataset", *tiny_overrides, f"dataset.root={tmp_path / 'data'}"]
     run = subprocess.Popen(
         [*command, "dataset.workers=2"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=tmp_path
     )

@@ -3,7 +3,7 @@
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.making import finished
 from dexgrasp.dataset.object_sample import sampled_objects
 from dexgrasp.dataset.shard import Item, write_shard
+from dexgrasp.dataset.stages import key
 from dexgrasp.dataset.store import Store
 from dexgrasp.dataset.synthesis_sample import sampled_grasps
 from dexgrasp.progress import track
@@ -126,13 +127,20 @@ class _Sample:
             return self._alike(stage)
         guess = sampled_grasps(self.dataset, self.pool, self.workers, self.seconds, self.objects)
         self.scale = self.objects / len(guess.items)
-        size = self.store(stage, guess.items) * self.scale
+        # What follows knows the objects only whose grasps are there.
+        known = self.dataset.store("objects")
+        objects = [replace(known[int(item.key)], key=key(i)) for i, item in enumerate(guess.items)]
+        self.dataset = Dataset(self.dataset.config, self.dataset.hand_config, {}, self.dataset.representation)
+        self.store("objects", objects, "objects-with-grasps")
+        size = self.store(stage, [replace(item, key=key(i)) for i, item in enumerate(guess.items)]) * self.scale
         return Predicted(stage, self.objects, guess.seconds, size, guess.basis, guess.processor)
 
     def _alike(self, name: str) -> Predicted:
         """A stage of many items that are much alike."""
         work = pipeline.work_of(name, {}, self.dataset)
         inputs = work.inputs()
+        if name == "scenes":  # the config says how many; what came before counted objects
+            self.scale = 1.0
         total = round(len(inputs) * self.scale)
         if not total:
             self.store(name, [])
@@ -143,7 +151,7 @@ class _Sample:
         pieces = [chosen[start : start + step] for start in range(0, len(chosen), step)]
         tasks = (joblib.delayed(timed)(self.dataset, work.make, list(piece)) for piece in pieces)
         found = [one for piece in track(self.pool(tasks), f"sample of {name}", len(pieces)) for one in piece]
-        made = sorted(found, key=lambda one: one.item.key)
+        made = sorted(found, key=lambda one: str(one.item.key))
         size = self.store(name, [one.item for one in made]) * total / len(made)
         if name in ("scenes", "views"):  # what follows is made of the sample
             self.scale = total / len(made)
@@ -152,7 +160,7 @@ class _Sample:
                 **self.dataset.config,
                 "scenes": {**self.dataset.config["scenes"], "count": len(made)},
             }
-        each, processor = (float(np.mean([getattr(one, key) for one in made])) for key in ("seconds", "processor"))
+        each, processor = (float(np.mean([getattr(one, kind) for one in made])) for kind in ("seconds", "processor"))
         extra, built = 0.0, [seconds for one in made for seconds in one.built]
         if built and not self.charged:  # every worker builds the fields of all objects, once
             extra, self.charged = float(np.mean(built)) * self.objects, True
@@ -163,9 +171,9 @@ class _Sample:
         share = total / self.workers
         return Predicted(name, total, share * each + extra, size, basis, share * processor + extra)
 
-    def store(self, stage: str, items: Sequence[Item]) -> int:
+    def store(self, stage: str, items: Sequence[Item], name: str | None = None) -> int:
         """Keep a sample as the store of its stage; return its bytes."""
-        folder = self.folder / stage
+        folder = self.folder / (name or stage)
         store = Store.create(folder, stage, {"objects": self.dataset.config["objects"]}, 0, 1)
         shard = write_shard(folder, 0, items)
         store.finish()

@@ -157,7 +157,7 @@ def _grasps(sources: Sequence[Source], index: int) -> Item:
     found = [item for item, _ in _parts(sources, "grasps", index)]
     tensors = {name: torch.cat([item.tensors[name] for item in found]) for name in found[0].tensors}
     kept = sum(item.facts["kept"] for item in found)
-    return Item(key(index), tensors, {**found[0].facts, "kept": kept})
+    return Item(key(index), tensors, {"name": found[0].facts["name"], "kept": kept, "joined": len(found)})
 
 
 def _verdicts(sources: Sequence[Source], index: int) -> Item:

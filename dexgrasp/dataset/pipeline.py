@@ -56,6 +56,7 @@ def ensure(
     and damaged stores.
     """
     settings, hand = plain(config), plain(hand)
+    settings = _given(settings, hand)
     told = None if representation is None else plain(representation)
     folders: dict[str, Path] = {}
     with ExitStack() as stack:
@@ -82,15 +83,37 @@ def plan(
     """
     identity = _identity(hand, _check(settings, hand, told))
     root = Path(settings["root"]).expanduser().absolute()
-    found, parent = [], ""
-    optional = {"verdicts": settings.get("verify"), "labels": told}
+    found: list[tuple[str, dict[str, Any], Path]] = []
+    parent, optional = "", {"verdicts": settings.get("verify"), "labels": told}
+    made = Dataset.open(settings["path"]) if settings.get("path") else None
     for stage in STAGES:
         if not optional.get(stage, True):
+            continue
+        same = stage != "labels" or (
+            made and (made.representation, made.config["labels"]) == (told, settings["labels"])
+        )
+        if made and stage in made.folders and same:
+            parent = made.folders[stage].name.rpartition("-")[2]
+            found.append((stage, made.store(stage).manifest["config"], made.folders[stage]))
             continue
         content = _content(stage, settings, identity, told) | {"after": parent, "revision": REVISION}
         parent = digest(content)
         found.append((stage, content, root / f"{stage}-{parent}"))
     return found
+
+
+def _given(settings: dict[str, Any], hand: dict[str, Any]) -> dict[str, Any]:
+    """Return settings in which those of the dataset at `path`, if there is one, stand for all that made its stages."""
+    if not settings.get("path"):
+        return settings
+    made = Dataset.open(settings["path"])
+    here, there = ({name: value for name, value in each.items() if name != "urdf"} for each in (hand, made.hand_config))
+    if here != there:
+        remedy = f"choose hand={made.hand_config['name']} with its options"
+        raise DexgraspError(f"hand {there} for the dataset in {settings['path']}", str(here), remedy)
+    ours = ("path", "workers", "backend", "address", "labels")
+    kept: dict[str, Any] = {name: settings[name] for name in ours if name in settings}
+    return {**made.config, **kept, "root": str(list(made.folders.values())[-1].parent)}
 
 
 def summary(dataset: Dataset) -> list[Made]:
