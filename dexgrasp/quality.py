@@ -12,9 +12,11 @@ from torch import Tensor
 
 from dexgrasp.contact_wrenches import compiled_wrenches, cone_edges, differentiable_wrenches
 from dexgrasp.errors import DexgraspError
+from dexgrasp.seeds import stream
 from dexgrasp.wrench_hull import DECIDE, FACET, SIZE, VOLUME, evaluate
 
 Array = Tensor | np.ndarray
+JOGGLE = 1e-9
 
 
 def wrenches(
@@ -56,8 +58,10 @@ def wrenches(
 def epsilon(wrenches: Array, threshold: float | None = None, contacts: int = 0) -> Array:
     """Return the radius (N,) of the largest ball about the origin inside each hull of wrenches (N, W, 6).
 
-    Exact to 1e-11 for wrenches of order 1; exactly 0 where the origin is not strictly inside or the set spans fewer
-    than six dimensions. With a threshold, sets certified to lie below it give 0 at once and the others stay exact.
+    Exact to 1e-11 for wrenches of order 1 (1e-10 where seven are coplanar to 1e-12 to 1e-9 only); exactly 0 where the
+    origin is not strictly inside or the set spans fewer than six dimensions. With a threshold, sets certified to lie
+    below it give 0 at once and the others stay exact.
+
     The hull is L1, that of all wrenches; with `contacts` > 0, to which the wrenches belong in order and equal parts,
     it is L-infinity: the Minkowski sum over contacts of conv(0, their wrenches), every finger pressing up to 1.
     """
@@ -70,8 +74,17 @@ def reaches(wrenches: Array, threshold: float, contacts: int = 0) -> Array:
 
 
 def volume(wrenches: Array, contacts: int = 0) -> Array:
-    """Return the 6-D volume (N,) of each hull of wrenches (N, W, 6); 0 for sets of fewer dimensions."""
-    return _as(wrenches, _evaluate(wrenches, contacts, -math.inf, VOLUME)[0])
+    """Return the 6-D volume (N,) of each hull of wrenches (N, W, 6); 0 for sets of fewer than six dimensions.
+
+    Exact to 1e-7 of it. For the L1 hull wrenches are moved by up to 1e-9 first, always by the same, so that no seven
+    lie on a plane; for L-infinity, those that shall (of one cone) must do so to rounding, as `wrenches` makes them.
+    """
+    dense = _dense(wrenches, contacts)
+    noise = 0.0 if contacts else JOGGLE * stream(0, "joggle").uniform(-1, 1, dense.shape[1:])
+    found = _evaluate(dense + noise, contacts, -math.inf, VOLUME)
+    spread = dense if contacts else dense - dense.mean(axis=1, keepdims=True)
+    full = np.linalg.matrix_rank(spread, tol=10 * JOGGLE) == 6
+    return _as(wrenches, np.where(full, found[0], 0.0))
 
 
 def nearest_facet(wrenches: Array, contacts: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -86,6 +99,20 @@ def nearest_facet(wrenches: Array, contacts: int = 0) -> tuple[np.ndarray, np.nd
 def _evaluate(
     wrenches: Array, contacts: int, threshold: float, wanted: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    dense = _dense(wrenches, contacts)
+    if not dense.shape[1]:
+        return np.zeros(len(dense)), np.zeros((len(dense), 6)), np.full((len(dense), 6), -1)
+    found = evaluate(dense, int(contacts), float(threshold), wanted)
+    if np.isnan(found[0]).any():
+        raise DexgraspError(
+            "wrenches of order 1",
+            f"set {int(np.isnan(found[0]).argmax())} too near to degenerate for its size",
+            "scale torques by the object's radius, forces by the normal force",
+        )
+    return found
+
+
+def _dense(wrenches: Array, contacts: int) -> np.ndarray:
     if wrenches.ndim != 3 or wrenches.shape[-1] != 6:
         raise DexgraspError("wrenches of shape (N, W, 6)", f"shape {tuple(wrenches.shape)}", "stack sets of wrenches")
     if contacts < 0 or (contacts and wrenches.shape[1] % contacts):
@@ -97,16 +124,7 @@ def _evaluate(
     dense = np.ascontiguousarray(wrenches, dtype=np.float64)
     if not np.isfinite(dense).all():
         raise DexgraspError("finite wrenches", "NaN or infinity", "give untouched contacts zero wrenches")
-    if not dense.shape[1]:
-        return np.zeros(len(dense)), np.zeros((len(dense), 6)), np.full((len(dense), 6), -1)
-    found = evaluate(dense, int(contacts), float(threshold), wanted)
-    if np.isnan(found[0]).any():
-        raise DexgraspError(
-            "wrenches of order 1",
-            f"set {int(np.isnan(found[0]).argmax())} too near to degenerate for its size",
-            "scale torques by the object's radius, forces by the normal force",
-        )
-    return found
+    return dense
 
 
 def _as(given: Array, result: np.ndarray) -> Array:

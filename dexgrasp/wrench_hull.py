@@ -14,9 +14,9 @@ from dexgrasp.heap import pop, push
 from dexgrasp.wrench_support import (
     DIM,
     ZERO,
-    Vector,
     determinant,
     dot,
+    plane,
     random_words,
     row,
     simplex,
@@ -28,6 +28,8 @@ COPLANAR = 1e-11
 """Points this little above a facet's plane (wrenches of order 1) count as on it: the facet is final, bounds have met.
 A set that is torn by rounding all the same is done again with ten times as much, up to"""
 COARSEST = 1e-7
+GENERIC = 1e-13
+"""For volumes of L1 hulls, whose wrenches are in general position: there every facet counts, not only the nearest."""
 DISTANCE, EDGE, STATE = 6, 6, 12
 """Columns: a plane's distance, the facets across, whether a facet is gone (odd)."""
 SIZE, DECIDE, FACET, VOLUME = range(4)
@@ -52,7 +54,8 @@ def evaluate(
     result, normals, names = np.zeros(len(sets)), np.zeros((len(sets), DIM)), np.full((len(sets), DIM), -1)
     wrenches, rest, values = np.empty((DIM, count)), np.empty((DIM, count)), np.empty(count)
     axes, first = np.empty((DIM, DIM)), np.empty((DIM + 1, DIM))
-    room, n, tolerance = 512, 0, COPLANAR
+    least = GENERIC if wanted == VOLUME and contacts == 0 else COPLANAR
+    room, n, tolerance = 512, 0, least
     while n < len(sets):
         # On a set that needs more room than there is, start over with twice as much.
         planes, links, hashes = np.empty(8 * room), np.empty(16 * room, np.uint32), np.empty(room, np.uint64)
@@ -78,15 +81,9 @@ def evaluate(
                     tolerance *= 10.0
                     continue
                 result[n] = np.nan if found == TORN else found
-            tolerance = COPLANAR
+            tolerance = least
             n += 1
     return result, normals, names
-
-
-@njit(cache=True)
-def _plane(planes: np.ndarray, f: int) -> Vector:
-    at = 8 * f
-    return planes[at], planes[at + 1], planes[at + 2], planes[at + 3], planes[at + 4], planes[at + 5]
 
 
 @njit(cache=True)
@@ -138,7 +135,7 @@ def _grow(
         apex += 1
         if apex == len(words):
             return FULL
-        u = _plane(planes, facet)
+        u = plane(planes, facet)
         reach, named[apex] = support(wrenches, contacts, u, values, corners, apex)
         if wanted == VOLUME:
             if reach - lower <= tolerance:
@@ -167,7 +164,7 @@ def _grow(
                 return FULL
             for k in range(DIM):
                 g = links[16 * f + EDGE + k]
-                height = dot(_plane(planes, g), p) - planes[8 * g + DISTANCE]
+                height = dot(plane(planes, g), p) - planes[8 * g + DISTANCE]
                 planes[8 * g + 7] = height
                 sees = height > tolerance
                 ridges[2 * horizon], ridges[2 * horizon + 1] = f, k
@@ -182,7 +179,7 @@ def _grow(
         for r in range(horizon):
             new, f = np.uint32(count + r), ridges[2 * r]
             g = links[16 * f + EDGE + ridges[2 * r + 1]]
-            a, b, x, y = planes[8 * f + 7], planes[8 * g + 7], _plane(planes, g), _plane(planes, f)
+            a, b, x, y = planes[8 * f + 7], planes[8 * g + 7], plane(planes, g), plane(planes, f)
             b = b if b < -tolerance else 0.0
             n0, n1, n2 = a * x[0] - b * y[0], a * x[1] - b * y[1], a * x[2] - b * y[2]
             n3, n4, n5 = a * x[3] - b * y[3], a * x[4] - b * y[4], a * x[5] - b * y[5]

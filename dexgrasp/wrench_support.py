@@ -22,6 +22,13 @@ def row(array: np.ndarray, i: int) -> Vector:
 
 
 @njit(cache=True)
+def plane(planes: np.ndarray, f: int) -> Vector:
+    """Read the normal of facet f; see wrench_hull."""
+    at = 8 * f
+    return planes[at], planes[at + 1], planes[at + 2], planes[at + 3], planes[at + 4], planes[at + 5]
+
+
+@njit(cache=True)
 def dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
 

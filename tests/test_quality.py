@@ -9,7 +9,7 @@ import torch
 from scipy.spatial import ConvexHull
 
 from dexgrasp.errors import DexgraspError
-from dexgrasp.quality import epsilon, reaches, wrenches
+from dexgrasp.quality import epsilon, reaches, volume, wrenches
 
 
 def grasps(count, fingers, seed=0, tilt=0.3):
@@ -128,6 +128,8 @@ def test_golden_values_of_graspit(shared):
         expected = grasp["epsilon_L1"] if grasp["epsilon_L1"] > 1e-6 else 0.0
         assert expected or epsilon(sets)[0] == 0
         differences.append(abs(epsilon(sets)[0] - expected))
+        if len(grasp["contacts"]) < 8:
+            assert volume(sets)[0] == pytest.approx(grasp["volume_L1"], rel=0.01, abs=1e-9)
     assert sum(g["epsilon_L1"] > 0 for g in golden) == 67
     differences = np.sort(differences)
     assert differences[-3] < 1e-9

