@@ -29,7 +29,7 @@ COPLANAR = 1e-11
 A set that is torn by rounding all the same is done again with ten times as much, up to"""
 COARSEST = 1e-7
 GENERIC = 1e-13
-"""For volumes of L1 hulls, whose wrenches are in general position: there every facet counts, not only the nearest."""
+"""The same for volumes of L1 hulls: every facet counts, and wrenches are in general position."""
 DISTANCE, EDGE, STATE = 6, 6, 12
 """Columns: a plane's distance, the facets across, whether a facet is gone (odd)."""
 SIZE, DECIDE, FACET, VOLUME = range(4)
@@ -187,17 +187,15 @@ def _grow(
             scale, at = 1.0 / np.sqrt(dot(x, x)), 8 * new
             if scale * tolerance > 1.0:
                 return TORN
-            planes[at], planes[at + 1], planes[at + 2] = n0 * scale, n1 * scale, n2 * scale
-            planes[at + 3], planes[at + 4], planes[at + 5] = n3 * scale, n4 * scale, n5 * scale
-            planes[at + DISTANCE] = dot(x, p) * scale
+            planes[at], planes[at + 1], planes[at + 2], planes[at + 3] = n0 * scale, n1 * scale, n2 * scale, n3 * scale
+            planes[at + 4], planes[at + 5], planes[at + DISTANCE] = n4 * scale, n5 * scale, dot(x, p) * scale
 
         # Two new facets meet where all corners but one are the same: their numbers meet in one cell of a hash table.
         cells = 64
         while cells < 16 * horizon:
             cells *= 2
         mask = np.uint64(cells - 1)
-        table[:cells] = 0
-        pairs[:cells] = 0
+        table[:cells], pairs[:cells] = 0, 0
         for r in range(horizon):
             new, f, k = np.uint32(count + r), ridges[2 * r], ridges[2 * r + 1]
             g = links[16 * f + EDGE + k]
