@@ -8,7 +8,7 @@ from pathlib import Path
 from dexgrasp.errors import DexgraspError, room
 
 PIPELINES = {
-    "dataset": "objects -> grasps -> scenes -> views -> labels",
+    "dataset": "objects -> grasps -> scenes -> views -> labels; dataset estimate|inspect|verify|merge|export|card",
     "train": "train a network, evaluate it in physics, show the result",
     "eval": "run a trained network (or the labels) in physics",
     "predict": "grasps for one point cloud or depth image",
