@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dexgrasp.batch import Batch
 from dexgrasp.collision import as_arrays, deepest
-from dexgrasp.distal_contact import MOST, distal_contact, is_tip
+from dexgrasp.distal_contact import BLUR, MOST, distal_contact, is_tip
 from dexgrasp.distance import DistanceField, Field, interpolated, quick_bound, seed_at
 from dexgrasp.hand import Hand
 from dexgrasp.hand_body import HandBody, carry, hand_body, place_link, place_links
@@ -19,6 +19,8 @@ from dexgrasp.triangle_tree import nearest
 
 TOUCH = 4e-5
 """A finger touches where the gap is at most this, m."""
+SPARE = TOUCH / 2
+"""Steps leave this much, m: links must not stop in the surface itself, where rounding decides."""
 NEAR = 0.5
 """A bounding ball is split once the surface is nearer than this many times what splitting may gain."""
 CLOSE = 5e-4
@@ -106,14 +108,19 @@ def close_fingers(
     depth = np.zeros(count)
     poses = np.empty((len(body.parents), 3, 4))
     rate, done = np.empty(len(body.offset)), np.zeros(fingers, np.bool_)
+    ways, free = np.zeros((len(body.part_links), 3)), np.zeros(len(body.parents), np.bool_)
     due, nodes = np.empty(len(body.cover.balls)), np.empty(len(body.cover.balls), np.int64)
     chain, work, hit, found = np.empty(len(body.parents), np.int64), np.empty(SCRATCH), np.empty(7), np.empty((MOST, 8))
+    contact = np.empty(7)
     for i in range(count):
         place_links(body, joints[i], bases[i], full[i], poses)
         if strict and deepest(body, field, poses, -limit, True) < -limit:
             status[i] = PENETRATES
             continue
         done[:] = False
+        free[:] = False
+        ways[:] = 0.0
+        ways[:, 0] = 1.0
         for finger in range(fingers):
             if done[finger]:
                 continue
@@ -121,7 +128,9 @@ def close_fingers(
                 rate[m] = 0.0
                 for j in range(joints.shape[1]):
                     rate[m] += body.coupling[m, j] * body.rates[finger, j]
-            touched = _advance(body, field, bases[i], finger, rate, full[i], poses, due, nodes, chain, work, hit)
+            touched = _advance(
+                body, field, bases[i], finger, rate, full[i], poses, due, nodes, chain, free, ways, work, hit
+            )
             while breakaway and touched >= 0 and touched != body.tip_links[finger]:
                 # The link that touches and all above it stop; what lies beyond goes on.
                 link = touched
@@ -129,7 +138,9 @@ def close_fingers(
                     if body.drives[link] >= 0:
                         rate[body.drives[link]] = 0.0
                     link = body.parents[link]
-                touched = _advance(body, field, bases[i], finger, rate, full[i], poses, due, nodes, chain, work, hit)
+                touched = _advance(
+                    body, field, bases[i], finger, rate, full[i], poses, due, nodes, chain, free, ways, work, hit
+                )
             for other in range(finger, fingers):
                 shared = other == finger
                 for j in range(joints.shape[1]):
@@ -137,16 +148,19 @@ def close_fingers(
                 if not shared or touched < 0:
                     continue
                 done[other] = True
-                if other != finger or touched == body.tip_links[finger]:
-                    if not distal_contact(body, field, poses, other, other == finger, nodes, found, hit):
+                tip = body.tip_links[other]
+                if touched == tip or not _above(body.parents, touched, tip):
+                    if not distal_contact(body, field, poses, other, touched == tip, nodes, found, contact):
                         continue
-                    on_tip[i, other] = is_tip(body, poses, other, hit)
-                touches[i, other] = hit[1:7]
+                    on_tip[i, other] = is_tip(body, poses, other, contact)
+                    touches[i, other] = contact[1:7]
+                else:
+                    touches[i, other] = hit[1:7]
             if strict and not on_tip[i, finger]:
                 status[i] = MISSES if np.isnan(touches[i, finger, 0]) else OFF_TIP
                 break
         if not strict:
-            depth[i] = max(0.0, -deepest(body, field, poses, 0.0, False))
+            depth[i] = _depth(body, field, poses, free, nodes, hit)
     return status, full, touches, on_tip, depth
 
 
@@ -162,15 +176,18 @@ def _advance(
     due: np.ndarray,
     nodes: np.ndarray,
     chain: np.ndarray,
+    free: np.ndarray,
+    ways: np.ndarray,
     work: np.ndarray,
     hit: np.ndarray,
 ) -> int:
     """Move joints at `rate` from `full` until a link touches; return it, or -1 at the limits.
 
-    `full` and `poses` end at that posture; `hit` is the touch: distance, point and normal. Every waiting node of the
+    `full` and `poses` end at that posture; `hit` is the touch: distance, point and normal; links that moved without
+    an overlap are `free`. Every waiting node of the
     covering trees holds the time before which nothing below it can touch: its distance over its largest speed.
     """
-    cover, motions, limits, tree = body.cover, body.motions, body.limits, field.tree
+    cover, motions, limits, shapes, tree = body.cover, body.motions, body.limits, body.shapes, field.tree
     balls, children, gains, owners = cover.balls, cover.children, cover.gains, cover.links
     speeds, patch_speeds = cover.speeds[finger], cover.patch_speeds[finger]
     start, end = full.copy(), 0.0
@@ -208,19 +225,22 @@ def _advance(
                 nodes[k], nodes[size], due[size] = children[node, 0], children[node, 1], time
                 size += 1
                 continue
-            wait = gap / speeds[node]
+            wait = (gap - SPARE) / speeds[node]
             if gap < CLOSE and children[node, 0] < 0:
                 if time == 0 and interpolated(field, x, y, z) < field.spacing:
                     nearest(tree, x, y, z, seed_at(field, x, y, z), hit)
                     if hit[0] < 0:  # the link starts inside the object
                         return link
+                part = cover.parts[node]
                 work[7, 0, 0], work[7, 0, 1], work[7, 0, 2] = x, y, z
                 apart = patch_distance(
-                    body.shapes, tree, poses[link], cover.parts[node], balls[node, 3], EXACT, REACH, work, hit
+                    shapes, tree, poses[link], part, ways[part], balls[node, 3], EXACT, REACH, work, hit
                 )
                 if apart <= TOUCH:
+                    for c in range(links):
+                        free[chain[c]] |= time > 0
                     return link
-                wait = max(wait, apart / patch_speeds[node])
+                wait = max(wait, (apart - SPARE) / patch_speeds[node])
             due[k] = time + wait
             if due[k] <= end:
                 soonest = min(soonest, due[k])
@@ -230,6 +250,8 @@ def _advance(
                 due[k], nodes[k] = due[size], nodes[size]
         time = soonest
     _place(motions, limits, base, chain[:links], start, rate, end, full, poses)
+    for c in range(links):
+        free[chain[c]] = True
     return -1
 
 
@@ -250,3 +272,36 @@ def _place(
             full[m] = min(max(start[m] + rate[m] * time, limits[m, 0]), limits[m, 1])
     for k in range(len(chain)):
         place_link(motions, chain[k], full, base, poses)
+
+
+@njit(cache=True)
+def _above(parents: np.ndarray, link: int, below: int) -> bool:
+    while below >= 0 and below != link:
+        below = parents[below]
+    return below == link
+
+
+@njit(cache=True, error_model="numpy")
+def _depth(
+    body: HandBody, field: Field, poses: np.ndarray, free: np.ndarray, stack: np.ndarray, hit: np.ndarray
+) -> float:
+    """Return how deep the links that are not known to be free of the object are in it, 0 for none (m)."""
+    balls, children, tree = body.balls, body.children, field.tree
+    best = 0.0
+    for link in range(len(free)):
+        if free[link] or body.roots[link] < 0:
+            continue
+        stack[0], top = body.roots[link], 1
+        while top:
+            top -= 1
+            node = stack[top]
+            x, y, z = carry(poses, link, balls, node)
+            if quick_bound(field, x, y, z) - balls[node, 3] >= -best:
+                continue
+            if children[node, 0] >= 0:
+                stack[top], stack[top + 1] = children[node, 0], children[node, 1]
+                top += 2
+            elif interpolated(field, x, y, z) - balls[node, 3] < BLUR - best:
+                nearest(tree, x, y, z, seed_at(field, x, y, z), hit)
+                best = max(best, balls[node, 3] - hit[0])
+    return best

@@ -13,6 +13,8 @@ BLUR = 3e-4
 """What the grid's interpolation may be off near a surface, m."""
 NEAR = 5e-4
 """Where a link touches, some ball is nearer than this to the surface, m."""
+BARELY = 2e-5
+"""A link that stopped for another's sake touches where one of its balls is at most so near to the surface, m."""
 MOST = 256
 """Balls that are looked at."""
 TIE = 1e-12
@@ -43,11 +45,11 @@ def distal_contact(
     radius = body.tips[finger, 6]
     if abs(interpolated(field, x, y, z) - radius) <= FLAT + BLUR:
         nearest(field.tree, x, y, z, seed_at(field, x, y, z), hit)
-        if abs(hit[0] - radius) <= FLAT and _on_circle(body, poses, finger, hit):
+        if abs(hit[0] - radius) <= (FLAT if touches else BARELY) and _on_circle(body, poses, finger, hit):
             return True
     balls, children, first = body.balls, body.children, body.roots[link]
     # Of distances the grid's will do to tell which balls lie on the surface.
-    count, top, least = 0, 1, NEAR if touches else 0.0
+    count, top, least = 0, 1, NEAR if touches else BARELY - FLAT
     stack[0] = first
     while top and count < len(found):
         top -= 1

@@ -16,6 +16,7 @@ def patch_distance(
     tree: TriangleTree,
     pose: np.ndarray,
     part: int,
+    way: np.ndarray,
     radius: float,
     close: float,
     reach: float,
@@ -25,17 +26,18 @@ def patch_distance(
     """Return a lower bound of the distance of a convex part to the object near one of its covering leaves, m.
 
     Only triangles within `reach` of the leaf's ball are looked at, which has `radius` and whose centre in the object's
-    frame work[7, 0] holds: no other can be nearer to its patch. `inner` is the radius of the ball about that centre
-    which the part holds. `pose` is object_T_link. The bound is at most `reach`; below
-    `close` it is the distance itself, and `hit` becomes it, the object's nearest point and the unit direction
-    from there to the part; 0 and the object's normal for overlap.
+    frame work[7, 0] holds: no other can be nearer to its patch. `pose` is object_T_link. `way` is the unit direction,
+    in the link's frame, along which the two were apart last: a guess, that becomes the new one. The bound is at most
+    `reach`; below `close` it is the distance itself, and `hit` becomes it, the object's nearest point and the unit
+    direction from there to the part; 0 and the object's normal for overlap.
     """
     boxes, skips, firsts, corners, normals = tree
     corner = shapes.firsts[part]
-    triangle, told, aim, way = work[5], work[4], work[6, 0], work[6, 1]  # aim: of this triangle; way: of the best
+    triangle, told, aim = work[5], work[4], work[6, 0]
     x, y, z = work[7, 0]
-    best, height = reach, np.inf
-    way[:] = 0.0
+    best = reach
+    corner = support(shapes, corner, way[0], way[1], way[2])
+    height = along(shapes.corners, corner, way)
     around = (radius + best) * (radius + best)
     at, count = 0, len(boxes)
     while at < count:
@@ -53,25 +55,31 @@ def patch_distance(
                 a, b, c = corners[t, k, 0] - pose[0, 3], corners[t, k, 1] - pose[1, 3], corners[t, k, 2] - pose[2, 3]
                 for i in range(3):
                     triangle[k, i] = pose[0, i] * a + pose[1, i] * b + pose[2, i] * c
-            # Apart along the best way so far, or against the triangle's normal, or from the ball's centre?
-            if lowest(triangle, way) - height >= best:
+            # Apart along the last way, or against the triangle's normal, or from the ball's centre?
+            distance = lowest(triangle, way) - height
+            if distance >= best:
                 continue
-            for i in range(3):
-                aim[i] = -pose[0, i] * normals[t, 0, 0] - pose[1, i] * normals[t, 0, 1] - pose[2, i] * normals[t, 0, 2]
-            corner = support(shapes, corner, aim[0], aim[1], aim[2])
-            distance = lowest(triangle, aim) - along(shapes.corners, corner, aim)
             if distance < close:
-                u = 1.0 - v - w
-                a = u * corners[t, 0, 0] + v * corners[t, 1, 0] + w * corners[t, 2, 0] - x
-                b = u * corners[t, 0, 1] + v * corners[t, 1, 1] + w * corners[t, 2, 1] - y
-                c = u * corners[t, 0, 2] + v * corners[t, 1, 2] + w * corners[t, 2, 2] - z
-                length = np.sqrt(square)
                 for i in range(3):
-                    aim[i] = (pose[0, i] * a + pose[1, i] * b + pose[2, i] * c) / length
+                    aim[i] = (
+                        -pose[0, i] * normals[t, 0, 0] - pose[1, i] * normals[t, 0, 1] - pose[2, i] * normals[t, 0, 2]
+                    )
                 corner = support(shapes, corner, aim[0], aim[1], aim[2])
                 distance = lowest(triangle, aim) - along(shapes.corners, corner, aim)
                 if distance < close:
-                    distance, corner = to_polytope(shapes, corner, triangle, aim, close, best, work)
+                    u = 1.0 - v - w
+                    a = u * corners[t, 0, 0] + v * corners[t, 1, 0] + w * corners[t, 2, 0] - x
+                    b = u * corners[t, 0, 1] + v * corners[t, 1, 1] + w * corners[t, 2, 1] - y
+                    c = u * corners[t, 0, 2] + v * corners[t, 1, 2] + w * corners[t, 2, 2] - z
+                    length = np.sqrt(square)
+                    for i in range(3):
+                        aim[i] = (pose[0, i] * a + pose[1, i] * b + pose[2, i] * c) / length
+                    corner = support(shapes, corner, aim[0], aim[1], aim[2])
+                    distance = lowest(triangle, aim) - along(shapes.corners, corner, aim)
+                    if distance < close:
+                        distance, corner = to_polytope(shapes, corner, triangle, aim, close, best, work)
+            else:
+                aim[:] = way
             if distance >= best:
                 continue
             best = distance

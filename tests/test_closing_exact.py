@@ -10,11 +10,13 @@ from dexgrasp import load_hand
 from dexgrasp.closing import Closer
 from dexgrasp.collision import HandShape
 from dexgrasp.distance import DistanceField
+from dexgrasp.hand_body import hand_body, place_link
+from dexgrasp.urdf import UrdfHand
 
 GAP = PENETRATION = 5e-5
 """Demanded of a finger that touches, m."""
 STEP = 0.004
-"""Of the scan for what closing may have passed through, in the closing parameter."""
+"""Of the scan for what closing may have passed through: of the fastest joint, rad or m."""
 
 
 def as_coal(mesh: trimesh.Trimesh, convex: bool = False):
@@ -40,14 +42,18 @@ class Oracle:
         self.parts = {link: [as_coal(part, True) for part in parts] for link, parts in hand.collisions.items()}
 
     def frames(self, pose, full):
-        return {link: (pose @ frame[0]).numpy() for link, frame in self.hand.full_link_poses(full[None]).items()}
+        motions = hand_body(self.hand).motions
+        placed, base, joints = np.empty((len(motions), 3, 4)), pose[:3].numpy(), full.numpy()
+        for link in range(len(motions)):
+            place_link(motions, link, joints, base, placed)
+        return dict(zip(self.hand.link_names, placed, strict=True))
 
     def distance(self, pose, full, links):
         """Least signed distance of some links; negative: by how much a part and a triangle overlap."""
         frames = self.frames(pose, full)
         least = np.inf
         for link in links:
-            place = coal.Transform3s(frames[link][:3, :3], frames[link][:3, 3])
+            place = coal.Transform3s(frames[link][:, :3], frames[link][:, 3])
             for part in self.parts[link]:
                 found = coal.DistanceResult()
                 least = min(
@@ -58,7 +64,7 @@ class Oracle:
     def collides(self, pose, full, links):
         frames = self.frames(pose, full)
         for link in links:
-            place = coal.Transform3s(frames[link][:3, :3], frames[link][:3, 3])
+            place = coal.Transform3s(frames[link][:, :3], frames[link][:, 3])
             for part in self.parts[link]:
                 found = coal.CollisionResult()
                 if coal.collide(part, place, self.model, coal.Transform3s(), coal.CollisionRequest(), found):
@@ -113,31 +119,32 @@ def check(hand, closer, mesh, pose, joints, scan):
                 missed += 1
                 assert distance > 0, (i, finger, distance)
             if i % scan == 0:
-                assert not _passed(oracle, hand, pose[i], joints[i], closure.full[i], finger, links), (i, finger)
+                assert not _passed(oracle, closer, pose[i], joints[i], closure.full[i], finger, links), (i, finger)
     return touched, missed
 
 
-def _passed(oracle, hand, pose, start, full, finger, links):
-    """Whether the finger was in the object anywhere on its way."""
-    begin = hand.full_joints(start[None])[0]
-    end = begin.clone()
-    moving = torch.zeros(len(begin), dtype=torch.bool)
-    for joint, rate in hand.fingers[finger].closing.items():
-        unit = torch.zeros(1, len(hand.joint_names), dtype=torch.float64)
-        unit[0, hand.joint_names.index(joint)] = rate
-        moving |= ((hand.full_joints(unit) - hand.full_joints(0 * unit))[0]).abs() > 0
-    end[moving] = full[moving]
-    way = float((end - begin).abs().max())
-    steps = int(np.ceil(way / STEP))
-    return any(oracle.collides(pose, begin + (end - begin) * step / steps, links) for step in range(steps))
+def _passed(oracle, closer, pose, start, full, finger, links):
+    """Whether the finger was in the object anywhere on its way: all joints at their rates, each up to its limit."""
+    body = closer.body
+    begin = closer.hand.full_joints(start[None])[0].numpy()
+    rate = (body.rates @ body.coupling.T)[finger]
+    moving = rate != 0
+    way = ((full.numpy() - begin)[moving] / rate[moving]).max()
+    steps = int(np.ceil(way / STEP * np.abs(rate).max()))
+    posture = begin.copy()
+    for step in range(steps):
+        posture[moving] = np.clip(begin + rate * way * step / steps, *body.limits.T)[moving]
+        if oracle.collides(pose, torch.from_numpy(posture), links):
+            return True
+    return False
 
 
 THIN = ("coffeemug", "fryingpan", "bowl", "scissors", "eyeglasses", "025_mug", "024_bowl", "gd_pitcher_poisson_000")
 
 
-def free_hands(hand, mesh, count, rng):
+def free_hands(hand, mesh, count, rng, reach=(0.03, 0.12)):
     field = DistanceField.build(mesh)
-    pose, joints = around(mesh, hand, 8 * count, rng, (0.03, 0.12))
+    pose, joints = around(mesh, hand, 8 * count, rng, reach)
     free = HandShape(hand).object_distance(field, pose, joints) > 5e-4
     return pose[free][:count], joints[free][:count]
 
@@ -152,7 +159,74 @@ def test_fingers_touch_within_tolerance_of_coal(shared, name):
     assert touched >= 10
 
 
+INERTIAL = """<inertial><mass value="0.1"/>
+    <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>"""
+
+
+def link(name, shape, at="0 0 0"):
+    body = f'<collision><origin xyz="{at}"/><geometry>{shape}</geometry></collision>'
+    return f'<link name="{name}">{INERTIAL}{body}</link>'
+
+
+def joint(name, parent, child, kind, axis, at, limits, mimic="", turn="0 0 0"):
+    ends = f'<parent link="{parent}"/><child link="{child}"/><origin xyz="{at}" rpy="{turn}"/><axis xyz="{axis}"/>'
+    limit = f'<limit lower="{limits[0]}" upper="{limits[1]}" effort="5" velocity="1"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}{limit}{mimic}</joint>'
+
+
+PALM = link("palm", '<cylinder radius="0.03" length="0.01"/>')
+PAD, BONE = '<box size="0.008 0.02 0.05"/>', '<cylinder radius="0.007" length="0.04"/>'
+TIP = {"tip_radius": 0.005, "tip_center": [0, 0, 0.04]}
+
+
+def sliding(mimic):
+    """Two pads that slide towards each other: on their own, or the second with the first."""
+    follow = '<mimic joint="left" multiplier="1"/>' if mimic else ""
+    parts = [PALM, link("pad_left", PAD, "0 0 0.03"), link("pad_right", PAD, "0 0 0.03")]
+    parts += [joint("left", "palm", "pad_left", "prismatic", "1 0 0", "-0.05 0 0", (0, 0.045))]
+    parts += [joint("right", "palm", "pad_right", "prismatic", "-1 0 0", "0.05 0 0", (0, 0.045), follow)]
+    closing = ({"left": 1.0}, {"left": 1.0} if mimic else {"right": 1.0})
+    return parts, [{"name": f"pad_{s}", "link": f"pad_{s}", "closing": c, **TIP}
+                   for s, c in zip(("left", "right"), closing, strict=True)]  # fmt: skip
+
+
+def bending(count, coupled):
+    """Fingers of two links around a palm; the second joint follows the first, or closes beside it at its own rate."""
+    parts, fingers = [PALM], []
+    for k in range(count):
+        angle = 2 * np.pi * k / count
+        at, turn = f"{0.035 * np.cos(angle)} {0.035 * np.sin(angle)} 0", f"0 0 {angle}"
+        follow = f'<mimic joint="a{k}" multiplier="0.6"/>' if coupled else ""
+        parts += [link(f"p{k}", BONE, "0 0 0.02"), link(f"d{k}", BONE, "0 0 0.02")]
+        parts += [joint(f"a{k}", "palm", f"p{k}", "revolute", "0 -1 0", at, (-0.6, 1.2), "", turn)]
+        parts += [joint(f"b{k}", f"p{k}", f"d{k}", "revolute", "0 -1 0", "0 0 0.045", (-0.4, 0.6), follow)]
+        closing = {f"a{k}": 1.0} if coupled else {f"a{k}": 1.0, f"b{k}": 0.8}
+        fingers.append({"name": f"finger_{k}", "link": f"d{k}", "closing": closing, **TIP})
+    return parts, fingers
+
+
+HANDS = {
+    "jaw": sliding(True),
+    "two pads": sliding(False),
+    "five fingers": bending(5, True),
+    "synergy": bending(2, False),
+}
+
+
+@pytest.mark.parametrize("kind", HANDS)
+def test_any_hand_closes_on_what_it_meets(tmp_path, kind):
+    parts, fingers = HANDS[kind]
+    path = tmp_path / "hand.urdf"
+    path.write_text(f'<robot name="toy">{"".join(parts)}</robot>')
+    hand = UrdfHand("toy", path, fingers)
+    mesh = trimesh.creation.torus(0.022, 0.008)
+    pose, joints = free_hands(hand, mesh, 25, np.random.default_rng(1), (0.01, 0.06))
+    touched, _ = check(hand, Closer(hand), mesh, pose, joints, scan=3)
+    assert touched >= 10
+
+
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_a_thousand_closings_agree_with_coal(shared):
     hand = load_hand("barrett")
     closer = Closer(hand)
