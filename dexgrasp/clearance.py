@@ -20,6 +20,8 @@ from dexgrasp.scene import Boxes
 
 CHUNK = 4096
 """Postures whose links are kept at a time."""
+PLACES = 7
+"""Places along the way at which a few balls of each link are tried first: most of what collides is found there."""
 
 
 def above_table(
@@ -57,8 +59,43 @@ def clear_way(
         _avoid_boxes(body, box_T_world, halves, links, ways, retreat, margin, clear[rows])
         for number, field in enumerate(fields):
             frame, others = object_T_world[number], owners[rows] != number
-            _avoid_object(body, field.field, frame, links, ways, others, retreat, margin, clear[rows])
+            _avoid_object(body, shape.cores, field.field, frame, links, ways, others, retreat, margin, clear[rows])
     return torch.from_numpy(clear)
+
+
+@njit(cache=True)
+def _hits(
+    body: HandBody,
+    cores: np.ndarray,
+    field: Field,
+    poses: np.ndarray,
+    near: np.ndarray,
+    direction: np.ndarray,
+    retreat: float,
+    margin: float,
+) -> bool:
+    """Return whether some balls surely come nearer to an object than `margin`: by upper bounds from single nodes."""
+    h = field.spacing
+    nx, ny, nz = field.values.shape
+    for link in range(len(cores)):
+        if not near[link]:
+            continue
+        for ball in cores[link]:
+            if ball < 0:
+                break
+            x, y, z = carry(poses, link, body.balls, ball)
+            for place in range(PLACES if retreat > 0 else 1):
+                way = retreat * place / (PLACES - 1)
+                u = (x + way * direction[0] - field.origin[0]) / h
+                v = (y + way * direction[1] - field.origin[1]) / h
+                w = (z + way * direction[2] - field.origin[2]) / h
+                if u < 0 or v < 0 or w < 0 or u > nx - 1 or v > ny - 1 or w > nz - 1:
+                    continue
+                i, j, k = int(u + 0.5), int(v + 0.5), int(w + 0.5)
+                away = h * np.sqrt((u - i) ** 2 + (v - j) ** 2 + (w - k) ** 2)
+                if field.values[i, j, k] + away + 1e-6 < body.balls[ball, 3] + margin:
+                    return True
+    return False
 
 
 @njit(cache=True)
@@ -138,6 +175,7 @@ def _place(
 @njit(cache=True)
 def _avoid_object(
     body: HandBody,
+    cores: np.ndarray,
     field: Field,
     frame: np.ndarray,
     links: np.ndarray,
@@ -172,7 +210,8 @@ def _avoid_object(
         if found:
             for k in range(3):
                 direction[k] = frame[k, 0] * a + frame[k, 1] * b + frame[k, 2] * c
-            clear[i] = way_clear(body, field, poses, near, direction, retreat, -margin)
+            clear[i] = not _hits(body, cores, field, poses, near, direction, retreat, margin)
+            clear[i] = clear[i] and way_clear(body, field, poses, near, direction, retreat, -margin)
 
 
 @njit(cache=True)

@@ -11,6 +11,8 @@ from dexgrasp.hand import Hand
 from dexgrasp.hand_body import HandBody, carry, hand_body, place_links
 from dexgrasp.triangle_tree import nearest
 
+CORES = 6
+"""Balls of each link that are tried first."""
 SELF_OVERLAP = 5e-4
 """Links that overlap by more than this collide, m."""
 
@@ -24,6 +26,8 @@ class HandShape:
         parts = [part for name in (record.name for record in hand.tree) for part in hand.collisions.get(name, ())]  # type: ignore[attr-defined]
         self.corners = np.cumsum([0, *(len(part.vertices) for part in parts)])
         """First of `body.vertices` of each convex part, and their number."""
+        self.cores = _cores(self.body)
+        """(L, CORES) leaf balls of each link, large and apart from each other; -1 where there are none."""
         self._pairs: np.ndarray | None = None
 
     def object_distance(
@@ -84,6 +88,19 @@ class HandShape:
         """
         cloud = np.ascontiguousarray(points.detach().cpu().double().numpy())
         return torch.from_numpy(_cloud_depths(self.body, cloud, *as_arrays(pose, joints))).to(pose)
+
+
+def _cores(body: HandBody) -> np.ndarray:
+    cores = np.full((len(body.roots), CORES), -1)
+    leaves = np.flatnonzero(body.children[:, 0] < 0)
+    for link in range(len(cores)):
+        own = leaves[body.ball_links[leaves] == link]
+        own = own[body.balls[own, 3] > 0.5 * body.balls[own, 3].max(initial=0.0)]
+        away = np.full(len(own), np.inf)
+        for k in range(min(CORES, len(own))):
+            cores[link, k] = chosen = own[away.argmax()]
+            away = np.minimum(away, np.linalg.norm(body.balls[own, :3] - body.balls[chosen, :3], axis=1))
+    return cores
 
 
 def as_arrays(pose: Tensor, joints: Tensor) -> tuple[np.ndarray, np.ndarray]:
