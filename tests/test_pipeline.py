@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from omegaconf import DictConfig, open_dict
@@ -183,3 +184,38 @@ def test_interrupt_leaves_whole_shards_and_is_taken_up(
     assert not list(tmp_path.rglob("*.tmp"))
     config = composed(tmp_path / "data", "dataset.workers=1")
     assert manifests(make(config)) == manifests(made[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["threading", "dask", "ray"])
+def test_every_backend_makes_the_same_dataset(backend: str, made: Made, tmp_path: Path, composed: Composed) -> None:
+    if backend != "threading":
+        pytest.importorskip(backend)
+    config = composed(tmp_path / "data", f"dataset.backend={backend}", "dataset.workers=2")
+    assert manifests(make(config)) == manifests(made[1])
+
+
+@pytest.mark.slow
+def test_killed_runs_are_taken_up(made: Made, tmp_path: Path, composed: Composed, tiny_overrides: list[str]) -> None:
+    command = [sys.executable, "-m", "dexgrasp", "dataset", *tiny_overrides, f"dataset.root={tmp_path / 'data'}"]
+    for moment in np.random.default_rng(0).uniform(0.0, 1.0, 4):
+        before = len(list(tmp_path.rglob("*.tar")))
+        run = subprocess.Popen([*command, "dataset.workers=2"], stderr=subprocess.DEVNULL, cwd=tmp_path)
+        started = time.monotonic()
+        while len(list(tmp_path.rglob("*.tar"))) == before and run.poll() is None and time.monotonic() - started < 120:
+            time.sleep(0.02)
+        time.sleep(moment)
+        os.kill(run.pid, signal.SIGKILL)
+        run.wait()
+    assert manifests(make(composed(tmp_path / "data", "dataset.workers=1"))) == manifests(made[1])
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
+@pytest.mark.slow
+def test_jobs_of_a_cluster_make_one_dataset(made: Made, tmp_path: Path, tiny_overrides: list[str]) -> None:
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    command = [sys.executable, "-m", "dexgrasp", "dataset", "-m", "part=range(0,2)", "parts=2"]
+    command += ["hydra/launcher=submitit_local", f"dataset.root={tmp_path / 'data'}", "dataset.workers=1"]
+    done = subprocess.run([*command, *tiny_overrides], cwd=tmp_path, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert manifests(Dataset.open(tmp_path / "data")) == manifests(made[1])
