@@ -4,7 +4,10 @@ The public names below load on first use, so that ``import dexgrasp`` costs noth
 """
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from dexgrasp import kernel_cache
 
 if TYPE_CHECKING:
     from dexgrasp import quality
@@ -14,6 +17,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = ["load_backbone", "load_hand", "load_model", "load_representation", "open_dataset", "quality"]
+
+kernel_cache.separate(Path(__file__).parent)
 
 _HOMES = {
     "load_hand": "dexgrasp.plugins",

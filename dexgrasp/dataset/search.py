@@ -73,10 +73,10 @@ class Search:
         """What led to `grasps`."""
         self.promising, self.promise = self.draws, torch.zeros(0).double()
         """Draws whose preview has most epsilon, and how much."""
-        self.resting, share = _resting(item, settings.resting)
-        self.wanted = (settings.target * share).ceil().long().clamp(min=-(-settings.target // ROLLING))
+        self.resting, likelihood = _resting(item, settings.resting)
+        self.wanted = (settings.target * likelihood).ceil().long().clamp(min=-(-settings.target // ROLLING))
         """(K,) grasps wanted of those that the table leaves free in each resting pose: as it is likely."""
-        self.free = torch.zeros(0, len(share), dtype=torch.bool)
+        self.free = torch.zeros(0, len(likelihood), dtype=torch.bool)
         """(N, K) in which resting poses each of `grasps` is free."""
 
     @property

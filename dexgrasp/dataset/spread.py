@@ -91,9 +91,9 @@ def _sphere(count: int) -> Float[np.ndarray, "N 3"]:
 def _keys(numbers: Float[Tensor, "N K"]) -> Int[np.ndarray, "N"]:
     """Return one number for each row's cell of unit width; different cells differ but for one chance in 2^64."""
     cells = numbers.floor().long().numpy()
-    factors = np.random.default_rng(0).integers(-(2**63), 2**63 - 1, size=cells.shape[1]) | 1
+    factors = np.asarray(np.random.default_rng(0).integers(-(2**62), 2**62, size=cells.shape[1])) * 2 + 1
     keys = np.zeros(len(cells), dtype=np.int64)
-    for column, factor in zip(cells.T, factors, strict=True):
-        keys = (keys ^ column) * factor
+    for column in range(cells.shape[1]):
+        keys = (keys ^ cells[:, column]) * factors[column]
         keys ^= keys >> 29
     return keys
