@@ -78,58 +78,69 @@ def _tip_speeds(hand: Hand, body: HandBody) -> np.ndarray:
     return np.array(speeds)
 
 
-@njit(cache=True)
-def interpolate(field: Field, x: float, y: float, z: float) -> float:
-    """Return about the signed distance at a point (m): trilinear in the grid, to its box outside."""
-    h = field.spacing
-    u, v, w = (x - field.origin[0]) / h, (y - field.origin[1]) / h, (z - field.origin[2]) / h
-    nx, ny, nz = field.values.shape
+@njit(cache=True, error_model="numpy")
+def _distance(grid: np.ndarray, frame: np.ndarray, x: float, y: float, z: float) -> float:
+    """Return about the signed distance at a point (m): trilinear in the grid, to the object's box outside.
+
+    `frame` (10,) is the grid's origin and spacing and the object's box: small functions that take a whole `Field` or
+    `HandBody` spend most of their time counting references to its arrays.
+    """
+    u, v, w = (x - frame[0]) / frame[3], (y - frame[1]) / frame[3], (z - frame[2]) / frame[3]
+    nx, ny, nz = grid.shape
     if u < 0 or v < 0 or w < 0 or u > nx - 1 or v > ny - 1 or w > nz - 1:
-        box = field.tree.boxes[0]
-        dx = max(box[0] - x, x - box[3], 0.0)
-        dy = max(box[1] - y, y - box[4], 0.0)
-        dz = max(box[2] - z, z - box[5], 0.0)
+        dx = max(frame[4] - x, x - frame[7], 0.0)
+        dy = max(frame[5] - y, y - frame[8], 0.0)
+        dz = max(frame[6] - z, z - frame[9], 0.0)
         return math.sqrt(dx * dx + dy * dy + dz * dz)
     i, j, k = min(int(u), nx - 2), min(int(v), ny - 2), min(int(w), nz - 2)
     u, v, w = u - i, v - j, w - k
-    f = field.values
-    a = (f[i, j, k] * (1 - w) + f[i, j, k + 1] * w) * (1 - v) + (f[i, j + 1, k] * (1 - w) + f[i, j + 1, k + 1] * w) * v
-    i += 1
-    b = (f[i, j, k] * (1 - w) + f[i, j, k + 1] * w) * (1 - v) + (f[i, j + 1, k] * (1 - w) + f[i, j + 1, k + 1] * w) * v
-    return a * (1 - u) + b * u
+    low = (1 - v) * ((1 - w) * grid[i, j, k] + w * grid[i, j, k + 1])
+    low += v * ((1 - w) * grid[i, j + 1, k] + w * grid[i, j + 1, k + 1])
+    high = (1 - v) * ((1 - w) * grid[i + 1, j, k] + w * grid[i + 1, j, k + 1])
+    high += v * ((1 - w) * grid[i + 1, j + 1, k] + w * grid[i + 1, j + 1, k + 1])
+    return (1 - u) * low + u * high
 
 
-@njit(cache=True)
-def _buried(body: HandBody, field: Field, poses: np.ndarray, limit: float, stack: np.ndarray) -> bool:
-    for link in range(len(body.roots)):
-        if body.roots[link] < 0:
+@njit(cache=True, error_model="numpy")
+def _buried(
+    balls: np.ndarray,
+    children: np.ndarray,
+    roots: np.ndarray,
+    grid: np.ndarray,
+    frame: np.ndarray,
+    poses: np.ndarray,
+    limit: float,
+    stack: np.ndarray,
+) -> bool:
+    for link in range(len(roots)):
+        if roots[link] < 0:
             continue
-        stack[0] = body.roots[link]
+        stack[0] = roots[link]
         top = 1
         while top:
             top -= 1
             node = stack[top]
-            x, y, z = carry(poses, link, body.balls, node)
-            if interpolate(field, x, y, z) >= body.balls[node, 3] - limit:
+            x, y, z = carry(poses, link, balls, node)
+            if _distance(grid, frame, x, y, z) >= balls[node, 3] - limit:
                 continue
-            if body.children[node, 0] < 0:
+            if children[node, 0] < 0:
                 return True
-            stack[top], stack[top + 1] = body.children[node, 0], body.children[node, 1]
+            stack[top], stack[top + 1] = children[node, 0], children[node, 1]
             top += 2
     return False
 
 
-@njit(cache=True)
-def _tip(body: HandBody, chain: np.ndarray, finger: int, full: np.ndarray, tip: np.ndarray) -> None:
+@njit(cache=True, error_model="numpy")
+def _tip(motions: np.ndarray, chain: np.ndarray, center: np.ndarray, full: np.ndarray, tip: np.ndarray) -> None:
     """Write the fingertip centre in the frame of the first moving link's parent: a point needs no link poses."""
-    x, y, z = body.tips[finger, 0], body.tips[finger, 1], body.tips[finger, 2]
+    x, y, z = center[0], center[1], center[2]
     for c in range(len(chain) - 1, -1, -1):
         if chain[c] < 0:
             continue
-        motion = body.motions[chain[c]]
-        kind = int(motion[1])
+        m = chain[c]
+        kind = int(motions[m, 1])
         if kind:
-            q, a, b, d = full[int(motion[2])], motion[3], motion[4], motion[5]
+            q, a, b, d = full[int(motions[m, 2])], motions[m, 3], motions[m, 4], motions[m, 5]
             if kind == 1:
                 sine, cosine = math.sin(q), math.cos(q)
                 along = (1 - cosine) * (a * x + b * y + d * z)
@@ -141,19 +152,21 @@ def _tip(body: HandBody, chain: np.ndarray, finger: int, full: np.ndarray, tip: 
             else:
                 x, y, z = x + q * a, y + q * b, z + q * d
         x, y, z = (
-            motion[6] * x + motion[7] * y + motion[8] * z + motion[9],
-            motion[10] * x + motion[11] * y + motion[12] * z + motion[13],
-            motion[14] * x + motion[15] * y + motion[16] * z + motion[17],
+            motions[m, 6] * x + motions[m, 7] * y + motions[m, 8] * z + motions[m, 9],
+            motions[m, 10] * x + motions[m, 11] * y + motions[m, 12] * z + motions[m, 13],
+            motions[m, 14] * x + motions[m, 15] * y + motions[m, 16] * z + motions[m, 17],
         )
     tip[0], tip[1], tip[2] = x, y, z
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _trace(
-    body: HandBody,
-    field: Field,
+    motions: np.ndarray,
     chain: np.ndarray,
-    finger: int,
+    center: np.ndarray,
+    limits: np.ndarray,
+    grid: np.ndarray,
+    frame: np.ndarray,
     parent: np.ndarray,
     rate: np.ndarray,
     start: np.ndarray,
@@ -166,15 +179,15 @@ def _trace(
     for m in range(len(rate)):
         full[m] = start[m]
         if rate[m] != 0:
-            bound = body.limits[m, 1] if rate[m] > 0 else body.limits[m, 0]
+            bound = limits[m, 1] if rate[m] > 0 else limits[m, 0]
             end = max(end, (bound - start[m]) / rate[m])
     time = 0.0
     for _ in range(STEPS):
-        _tip(body, chain, finger, full, tip)
-        x, y, z = tip
+        _tip(motions, chain, center, full, tip)
+        x, y, z = tip[0], tip[1], tip[2]
         for k in range(3):
             tip[k] = parent[k, 0] * x + parent[k, 1] * y + parent[k, 2] * z + parent[k, 3]
-        gap = interpolate(field, tip[0], tip[1], tip[2]) - body.tips[finger, 6]
+        gap = _distance(grid, frame, tip[0], tip[1], tip[2]) - center[6]
         if abs(gap) < NEAR:
             return True
         time += (HASTE if gap > 0 else 1.0) * gap / speed
@@ -182,20 +195,20 @@ def _trace(
             return False
         for m in range(len(rate)):
             if rate[m] != 0:
-                full[m] = min(max(start[m] + rate[m] * time, body.limits[m, 0]), body.limits[m, 1])
+                full[m] = min(max(start[m] + rate[m] * time, limits[m, 0]), limits[m, 1])
     return False
 
 
-@njit(cache=True)
-def _foot(field: Field, at: np.ndarray, touch: np.ndarray) -> None:
+@njit(cache=True, error_model="numpy")
+def _foot(grid: np.ndarray, frame: np.ndarray, at: np.ndarray, touch: np.ndarray) -> None:
     """Write the surface point below `at` and its normal, as the grid's slope tells them."""
-    x, y, z = at
-    h = 0.5 * field.spacing
-    u = interpolate(field, x + h, y, z) - interpolate(field, x - h, y, z)
-    v = interpolate(field, x, y + h, z) - interpolate(field, x, y - h, z)
-    w = interpolate(field, x, y, z + h) - interpolate(field, x, y, z - h)
+    x, y, z = at[0], at[1], at[2]
+    h = 0.5 * frame[3]
+    u = _distance(grid, frame, x + h, y, z) - _distance(grid, frame, x - h, y, z)
+    v = _distance(grid, frame, x, y + h, z) - _distance(grid, frame, x, y - h, z)
+    w = _distance(grid, frame, x, y, z + h) - _distance(grid, frame, x, y, z - h)
     size = math.sqrt(u * u + v * v + w * w) + 1e-12
-    gap = interpolate(field, x, y, z)
+    gap = _distance(grid, frame, x, y, z)
     touch[3], touch[4], touch[5] = u / size, v / size, w / size
     for k in range(3):
         touch[k] = at[k] - gap * touch[3 + k]
@@ -211,6 +224,9 @@ def _look(
     speeds: np.ndarray,
     limit: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    motions, balls, children, roots, centers = body.motions, body.balls, body.children, body.roots, body.tips
+    grid, frame = field.values, np.empty(10)
+    frame[:3], frame[3], frame[4:] = field.origin, field.spacing, field.tree.boxes[0]
     count, fingers, movable = len(bases), len(body.tip_links), len(body.offset)
     status = np.zeros(count, np.int64)
     closed, touches = np.empty((count, movable)), np.full((count, fingers, 6), np.nan)
@@ -221,14 +237,28 @@ def _look(
     for i in range(count):
         place_links(body, joints[i], bases[i], start, poses)
         closed[i] = start
-        if _buried(body, field, poses, limit, stack):
+        if _buried(balls, children, roots, grid, frame, poses, limit, stack):
             status[i] = BURIED
             continue
         for finger in range(fingers):
-            above = body.parents[chains[finger, 0]]
+            above = int(motions[chains[finger, 0], 0])
             parent = poses[above] if above >= 0 else bases[i]
-            rate, chain = rates[finger], chains[finger]
-            if not _trace(body, field, chain, finger, parent, rate, start, speeds[finger], full, tips[finger]):
+            rate, chain, center = rates[finger], chains[finger], centers[finger]
+            reached = _trace(
+                motions,
+                chain,
+                center,
+                body.limits,
+                grid,
+                frame,
+                parent,
+                rate,
+                start,
+                speeds[finger],
+                full,
+                tips[finger],
+            )
+            if not reached:
                 status[i] = MISSED
                 break
             for m in range(movable):
@@ -236,5 +266,5 @@ def _look(
                     closed[i, m] = full[m]
         if status[i] == SEEN:
             for finger in range(fingers):
-                _foot(field, tips[finger], touches[i, finger])
+                _foot(grid, frame, tips[finger], touches[i, finger])
     return status, closed, touches
