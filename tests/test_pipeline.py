@@ -23,6 +23,8 @@ from dexgrasp.dataset.store import Store
 from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import inverse
 
+MADE = [stage for stage in pipeline.STAGES if stage != "verdicts"]
+"""What is made where nothing is to be verified by physics."""
 Composed = Callable[..., DictConfig]
 Made = tuple[DictConfig, Dataset]
 

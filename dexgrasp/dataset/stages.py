@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from threading import get_ident
 from typing import Any
 
 import torch
@@ -56,7 +57,9 @@ def make_scene(dataset: Dataset, index: int) -> Item:
     """Lay out scene `index` and find, among some grasps of each object, those that are free of all others."""
     config, objects = dataset.config, dataset.objects
     settings = settings_of(dataset)
-    scene = build_scene(objects, settings.clutter, _settler(config["simulator"]["settling"]), config["seed"], index)
+    scene = build_scene(
+        objects, settings.clutter, _settler(config["simulator"]["settling"], get_ident()), config["seed"], index
+    )
     numbers = [objects.names.index(name) for name in scene.objects]
     tried, chosen = [], []
     for row, number in enumerate(numbers):
@@ -108,8 +111,9 @@ def make_verdicts(dataset: Dataset, index: int) -> Item:
     return Item(key(index), tensors, facts)
 
 
-@lru_cache(1)
-def _settler(protocol: str) -> MujocoSimulator:
+@lru_cache(16)
+def _settler(protocol: str, thread: int) -> MujocoSimulator:
+    """Return a thread's own simulator: its worlds hold the state of what is simulated."""
     return MujocoSimulator(protocol)
 
 
