@@ -107,7 +107,7 @@ def test_edges_are_ragged_and_instances_follow() -> None:
     np.testing.assert_array_equal(instance == 0, depth < 0.5)
 
 
-@pytest.mark.parametrize("name", ["d435", "azure_kinect", "zivid", "kinect"])
+@pytest.mark.parametrize("name", ["plain", "d435", "azure_kinect", "zivid", "kinect"])
 def test_cameras_as_configured(name: str) -> None:
     """Depth is where it should be, most of it is there, and the same seed gives the same image."""
     sensor = Sensor.build(yaml.safe_load((conf_folder() / "camera" / f"{name}.yaml").read_text()))
