@@ -14,7 +14,7 @@ from dexgrasp.distal_contact import BLUR, MOST, distal_contact, is_tip
 from dexgrasp.distance import DistanceField, Field, interpolated, quick_bound, seed_at
 from dexgrasp.hand import Hand
 from dexgrasp.hand_body import HandBody, carry, hand_body, place_link, place_links
-from dexgrasp.patch_distance import SCRATCH, patch_distance
+from dexgrasp.patch_distance import SCRATCH, patch_time
 from dexgrasp.triangle_tree import nearest
 
 TOUCH = 4e-5
@@ -25,9 +25,7 @@ NEAR = 0.5
 """A bounding ball is split once the surface is nearer than this many times what splitting may gain."""
 CLOSE = 5e-4
 """Below this the grid's lower bound gives way to distances to triangles, m."""
-EXACT = 6e-5
-"""Below this a lower bound of a distance to triangles gives way to the distance itself, m."""
-REACH = 1e-3
+REACH = 5e-3
 """Triangles farther than this from a link are not looked at, m."""
 AHEAD = 1.0
 """What is due within this part of the last step is looked at early."""
@@ -93,7 +91,13 @@ class Closer:
 
 @njit(cache=True)
 def close_fingers(
-    body: HandBody, field: Field, bases: np.ndarray, joints: np.ndarray, breakaway: bool, strict: bool, limit: float
+    body: HandBody,
+    field: Field,
+    bases: np.ndarray,
+    joints: np.ndarray,
+    breakaway: bool,
+    strict: bool,
+    limit: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Close N hands; return status (N,), full joints (N, M), contact and normal (N, F, 6), on tip (N, F), depth (N,).
 
@@ -108,9 +112,21 @@ def close_fingers(
     depth = np.zeros(count)
     poses = np.empty((len(body.parents), 3, 4))
     rate, done = np.empty(len(body.offset)), np.zeros(fingers, np.bool_)
-    ways, free = np.zeros((len(body.part_links), 3)), np.zeros(len(body.parents), np.bool_)
-    due, nodes = np.empty(len(body.cover.balls)), np.empty(len(body.cover.balls), np.int64)
-    chain, work, hit, found = np.empty(len(body.parents), np.int64), np.empty(SCRATCH), np.empty(7), np.empty((MOST, 8))
+    ways, free = (
+        np.zeros((len(body.part_links), 3)),
+        np.zeros(len(body.parents), np.bool_),
+    )
+    due, nodes = (
+        np.empty(len(body.cover.balls)),
+        np.empty(len(body.cover.balls), np.int64),
+    )
+    twists = np.zeros((len(body.parents), 6))
+    chain, work, hit, found = (
+        np.empty(len(body.parents), np.int64),
+        np.empty(SCRATCH),
+        np.empty(7),
+        np.empty((MOST, 8)),
+    )
     contact = np.empty(7)
     for i in range(count):
         place_links(body, joints[i], bases[i], full[i], poses)
@@ -120,7 +136,6 @@ def close_fingers(
         done[:] = False
         free[:] = False
         ways[:] = 0.0
-        ways[:, 0] = 1.0
         for finger in range(fingers):
             if done[finger]:
                 continue
@@ -129,7 +144,21 @@ def close_fingers(
                 for j in range(joints.shape[1]):
                     rate[m] += body.coupling[m, j] * body.rates[finger, j]
             touched = _advance(
-                body, field, bases[i], finger, rate, full[i], poses, due, nodes, chain, free, ways, work, hit
+                body,
+                field,
+                bases[i],
+                finger,
+                rate,
+                full[i],
+                poses,
+                due,
+                nodes,
+                chain,
+                free,
+                ways,
+                twists,
+                work,
+                hit,
             )
             while breakaway and touched >= 0 and touched != body.tip_links[finger]:
                 # The link that touches and all above it stop; what lies beyond goes on.
@@ -139,7 +168,21 @@ def close_fingers(
                         rate[body.drives[link]] = 0.0
                     link = body.parents[link]
                 touched = _advance(
-                    body, field, bases[i], finger, rate, full[i], poses, due, nodes, chain, free, ways, work, hit
+                    body,
+                    field,
+                    bases[i],
+                    finger,
+                    rate,
+                    full[i],
+                    poses,
+                    due,
+                    nodes,
+                    chain,
+                    free,
+                    ways,
+                    twists,
+                    work,
+                    hit,
                 )
             for other in range(finger, fingers):
                 shared = other == finger
@@ -178,6 +221,7 @@ def _advance(
     chain: np.ndarray,
     free: np.ndarray,
     ways: np.ndarray,
+    twists: np.ndarray,
     work: np.ndarray,
     hit: np.ndarray,
 ) -> int:
@@ -187,9 +231,24 @@ def _advance(
     an overlap are `free`. Every waiting node of the
     covering trees holds the time before which nothing below it can touch: its distance over its largest speed.
     """
-    cover, motions, limits, shapes, tree = body.cover, body.motions, body.limits, body.shapes, field.tree
-    balls, children, gains, owners = cover.balls, cover.children, cover.gains, cover.links
-    speeds, patch_speeds = cover.speeds[finger], cover.patch_speeds[finger]
+    cover, motions, limits, shapes, tree = (
+        body.cover,
+        body.motions,
+        body.limits,
+        body.shapes,
+        field.tree,
+    )
+    balls, children, gains, owners = (
+        cover.balls,
+        cover.children,
+        cover.gains,
+        cover.links,
+    )
+    speeds, patch_speeds, bends = (
+        cover.speeds[finger],
+        cover.patch_speeds[finger],
+        cover.bends[finger],
+    )
     start, end = full.copy(), 0.0
     for m in range(len(rate)):
         if rate[m] != 0:
@@ -205,11 +264,14 @@ def _advance(
             if cover.roots[link] >= 0:
                 due[size], nodes[size] = 0.0, cover.roots[link]
                 size += 1
-    placed = time = 0.0
+    placed, time, pause = -1.0, 0.0, 0.0
     while size:
-        horizon = time + AHEAD * (time - placed)  # what is due soon is looked at now: placing links costs more
+        horizon = time + (
+            AHEAD * (time - placed) if placed >= 0 else 0.0
+        )  # what is due soon is looked at now: placing links costs more
         if time > placed:
             _place(motions, limits, base, chain[:links], start, rate, time, full, poses)
+            pause = _turn(motions, limits, chain[:links], start, rate, time, poses, twists)
             placed = time
         k, soonest = 0, np.inf
         while k < size:
@@ -222,7 +284,11 @@ def _advance(
             x, y, z = carry(poses, link, balls, node)
             gap = quick_bound(field, x, y, z) - balls[node, 3]
             if children[node, 0] >= 0 and gap <= NEAR * gains[node]:
-                nodes[k], nodes[size], due[size] = children[node, 0], children[node, 1], time
+                nodes[k], nodes[size], due[size] = (
+                    children[node, 0],
+                    children[node, 1],
+                    time,
+                )
                 size += 1
                 continue
             wait = (gap - SPARE) / speeds[node]
@@ -233,14 +299,21 @@ def _advance(
                         return link
                 part = cover.parts[node]
                 work[7, 0, 0], work[7, 0, 1], work[7, 0, 2] = x, y, z
-                apart = patch_distance(
-                    shapes, tree, poses[link], part, ways[part], balls[node, 3], EXACT, REACH, work, hit
-                )
-                if apart <= TOUCH:
+                way = ways[part]
+                seed = seed_at(field, x, y, z)
+                if way[0] == 0 and way[1] == 0 and way[2] == 0:
+                    for i in range(3):
+                        way[i] = -tree.normals[seed, 0, i]
+                most, fastest = min(pause, end) - time, patch_speeds[node]
+                clear = patch_time(
+                    shapes, tree, poses[link], twists[link], part, way, seed, balls[node, 3], fastest, bends[node],
+                    min(most, REACH / fastest), TOUCH, SPARE, work, hit,
+                )  # fmt: skip
+                if clear < 0:
                     for c in range(links):
                         free[chain[c]] |= time > 0
                     return link
-                wait = max(wait, (apart - SPARE) / patch_speeds[node])
+                wait = np.inf if clear == end - time else max(wait, clear)
             due[k] = time + wait
             if due[k] <= end:
                 soonest = min(soonest, due[k])
@@ -274,6 +347,56 @@ def _place(
         place_link(motions, chain[k], full, base, poses)
 
 
+@njit(cache=True, error_model="numpy")
+def _turn(
+    motions: np.ndarray,
+    limits: np.ndarray,
+    chain: np.ndarray,
+    start: np.ndarray,
+    rate: np.ndarray,
+    time: float,
+    poses: np.ndarray,
+    twists: np.ndarray,
+) -> float:
+    """Write the twists (L, 6) of the links that move; return the time until which joints keep their speeds."""
+    pause = np.inf
+    for k in range(len(chain)):
+        link = chain[k]
+        parent, kind, drive = (
+            int(motions[link, 0]),
+            int(motions[link, 1]),
+            int(motions[link, 2]),
+        )
+        twist, pose = twists[link], poses[link]
+        twist[:] = 0.0
+        if k and parent >= 0:
+            for above in range(k):
+                if chain[above] == parent:
+                    twist[:] = twists[parent]
+        if not kind or rate[drive] == 0:
+            continue
+        stop = (limits[drive, 1 if rate[drive] > 0 else 0] - start[drive]) / rate[drive]
+        if stop <= time:
+            continue
+        pause = min(pause, stop)
+        x, y, z = motions[link, 3], motions[link, 4], motions[link, 5]
+        a = rate[drive] * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z)
+        b = rate[drive] * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z)
+        c = rate[drive] * (pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z)
+        if kind == 1:
+            twist[0] += a
+            twist[1] += b
+            twist[2] += c
+            twist[3] += pose[1, 3] * c - pose[2, 3] * b
+            twist[4] += pose[2, 3] * a - pose[0, 3] * c
+            twist[5] += pose[0, 3] * b - pose[1, 3] * a
+        else:
+            twist[3] += a
+            twist[4] += b
+            twist[5] += c
+    return pause
+
+
 @njit(cache=True)
 def _above(parents: np.ndarray, link: int, below: int) -> bool:
     while below >= 0 and below != link:
@@ -283,7 +406,12 @@ def _above(parents: np.ndarray, link: int, below: int) -> bool:
 
 @njit(cache=True, error_model="numpy")
 def _depth(
-    body: HandBody, field: Field, poses: np.ndarray, free: np.ndarray, stack: np.ndarray, hit: np.ndarray
+    body: HandBody,
+    field: Field,
+    poses: np.ndarray,
+    free: np.ndarray,
+    stack: np.ndarray,
+    hit: np.ndarray,
 ) -> float:
     """Return how deep the links that are not known to be free of the object are in it, 0 for none (m)."""
     balls, children, tree = body.balls, body.children, field.tree

@@ -44,6 +44,8 @@ class Cover(NamedTuple):
     """(F, M) bound of a centre's speed per unit of a finger's closing parameter, whatever the posture."""
     patch_speeds: np.ndarray
     """(F, M) the same for every point of a leaf's patch."""
+    bends: np.ndarray
+    """(F, M) bound of the acceleration of these points at a constant closing speed."""
 
 
 def hand_cover(
@@ -70,16 +72,19 @@ def hand_cover(
             of_centers, of_points = (
                 np.array([_speeds(points, number, links, limits, rate) for rate in rates])
                 for points in (tree.balls[:, :3], np.concatenate(surface))
+            )  # (F, 2, K)
+            most = np.stack(
+                [p.max(axis=2, initial=STILL) for p in np.split(of_points, cuts, axis=2)],
+                axis=2,
             )
             trees.append(
                 tree._replace(
                     children=np.where(tree.children < 0, -1, tree.children + count),
                     parts=np.where(tree.parts < 0, -1, tree.parts + first),
                     links=np.full(len(tree.balls), number),
-                    speeds=of_centers,
-                    patch_speeds=np.stack(
-                        [p.max(axis=1, initial=STILL) for p in np.split(of_points, cuts, axis=1)], axis=1
-                    ),
+                    speeds=of_centers[:, 0],
+                    patch_speeds=most[:, 0],
+                    bends=most[:, 1],
                 )
             )
             roots[number] = count
@@ -88,23 +93,36 @@ def hand_cover(
     return Cover(
         *(
             roots if name == "roots" else np.concatenate([getattr(tree, name) for tree in trees], axis=axis)
-            for name, axis in zip(Cover._fields, (0, 0, 0, 0, 0, 0, 1, 1), strict=True)
+            for name, axis in zip(Cover._fields, (0, 0, 0, 0, 0, 0, 1, 1, 1), strict=True)
         )
     )
 
 
 def _speeds(
-    points: np.ndarray, link: int, links: Sequence[LinkRecord], limits: np.ndarray, rate: np.ndarray
+    points: np.ndarray,
+    link: int,
+    links: Sequence[LinkRecord],
+    limits: np.ndarray,
+    rate: np.ndarray,
 ) -> np.ndarray:
-    """Bound the speed of points (K, 3) of a link while the full joints move at `rate`, whatever the posture."""
-    speeds, reach = np.zeros(len(points)), np.zeros(len(points))
+    """Bound speed and acceleration (2, K) of points (K, 3) of a link, whatever the posture, at joint speeds `rate`.
+
+    Moving joints i and k at once, k below i or i itself, accelerates a point by at most its distance to k's axis.
+    """
+    speeds, bends, reach = (
+        np.zeros(len(points)),
+        np.zeros(len(points)),
+        np.zeros(len(points)),
+    )
     turned = False
     while link >= 0:
         record = links[link]
         velocity = abs(rate[record.index]) if record.index >= 0 else 0.0
         # Distances to the axis of the joint at hand: exact for the last one, bounded by the chain's lengths above it.
         if record.kind == "revolute":
-            speeds += velocity * (reach if turned else np.linalg.norm(np.cross(points, record.axis), axis=1))
+            speed = velocity * (reach if turned else np.linalg.norm(np.cross(points, record.axis), axis=1))
+            bends += velocity * (speed + 2 * speeds)
+            speeds += speed
         elif record.kind == "prismatic":
             speeds += velocity
         if not turned and record.kind == "fixed":
@@ -116,7 +134,7 @@ def _speeds(
                 reach = reach + np.abs(limits[record.index]).max()
             reach = reach + np.linalg.norm(record.parent_T_joint[:3, 3])
         link = record.parent
-    return np.maximum(speeds, STILL)
+    return np.maximum([speeds, bends], STILL)
 
 
 def _link_cover(parts: Sequence[trimesh.Trimesh]) -> tuple[Cover, list[np.ndarray]]:
@@ -175,12 +193,15 @@ def _patches(pieces: np.ndarray, normals: np.ndarray, sides: np.ndarray) -> tupl
 
 
 def _tree(
-    leaves: np.ndarray, patches: list[np.ndarray], owners: np.ndarray, sides: list[np.ndarray]
+    leaves: np.ndarray,
+    patches: list[np.ndarray],
+    owners: np.ndarray,
+    sides: list[np.ndarray],
 ) -> tuple[Cover, list[np.ndarray]]:
     count = 2 * len(leaves) - 1
     none = np.zeros(0)  # what only the hand knows
     made = Cover(np.zeros((count, 4)), np.full((count, 2), -1), np.zeros(count), np.full(count, -1),
-                 none, none, none, none)  # fmt: skip
+                 none, none, none, none, none)  # fmt: skip
     middles = np.array([points.mean(axis=0) for points in patches])
     stands, surface = np.zeros(count), list[np.ndarray]()
     stack = [(np.arange(len(leaves)), -1, 0)]
@@ -195,12 +216,29 @@ def _tree(
         if len(members) == 1:
             made.parts[node] = owners[members[0]]
         else:
-            centers = np.concatenate([centers, [points.mean(axis=0), (points.min(axis=0) + points.max(axis=0)) / 2]])
-            order = np.argsort(middles[members, int(np.ptp(middles[members], axis=0).argmax())], kind="stable")
+            centers = np.concatenate(
+                [
+                    centers,
+                    [
+                        points.mean(axis=0),
+                        (points.min(axis=0) + points.max(axis=0)) / 2,
+                    ],
+                ]
+            )
+            order = np.argsort(
+                middles[members, int(np.ptp(middles[members], axis=0).argmax())],
+                kind="stable",
+            )
             half = len(members) // 2
-            stack += [(members[order[half:]], node, 1), (members[order[:half]], node, 0)]
+            stack += [
+                (members[order[half:]], node, 1),
+                (members[order[:half]], node, 0),
+            ]
         radii = np.linalg.norm(points[:, None] - centers, axis=2).max(axis=0)
-        depths = np.max([(body[:, 3] - centers @ body[:, :3].T).min(axis=1) for body in sides], axis=0)
+        depths = np.max(
+            [(body[:, 3] - centers @ body[:, :3].T).min(axis=1) for body in sides],
+            axis=0,
+        )
         best = int((radii - np.maximum(depths, 0)).argmin())
         made.balls[node] = (*centers[best], radii[best])
         stands[node] = radii[best] - max(depths[best], 0)
