@@ -53,11 +53,7 @@ def patch_time(
     clear = _until(gap - spare, rate, bend)
     # Or before the point that is nearest to the ball's centre, as far as the grid knows?
     square, v, w, _ = to_triangle(corners, seed, x, y, z)
-    length, u = np.sqrt(square), 1.0 - v - w
-    for i in range(3):
-        plane[i] = (
-            u * corners[seed, 0, i] + v * corners[seed, 1, i] + w * corners[seed, 2, i] - work[7, 0, i]
-        ) / length
+    _towards(corners, seed, square, v, w, work[7, 0], plane)
     other, other_rate, corner = _front(shapes, corner, pose, twist, plane, x, y, z, radius, work[6, 2])
     other_gap = _low(corners, seed, plane) - other
     other_clear = _until(other_gap - spare, other_rate, bend)
@@ -68,8 +64,7 @@ def patch_time(
         best = min(best, clear)
     floor, far, pace = ENOUGH * best, front, rate
     bar = front + spare + max(0.0, best * (rate + 0.5 * bend * best))
-    around = radius + spare + speed * best
-    around *= around
+    around = (radius + spare + speed * best) ** 2
     at, count = 0, len(boxes)
     while at < count:
         if to_box(boxes, at, x, y, z) >= around or _box_along(boxes, at, way) >= bar:
@@ -88,20 +83,15 @@ def patch_time(
             time = _until(height - front - spare, rate, bend)
             if time > floor and height > front + touch:
                 best, bar = time, height
-                around = radius + spare + speed * best
-                around *= around
+                around = (radius + spare + speed * best) ** 2
                 continue
             time = -1.0
             for guess in range(2):
                 if guess == 0:
-                    plane[:] = normals[t, 0]
-                    length = -1.0
-                else:
-                    u = 1.0 - v - w
-                    length = np.sqrt(square)
                     for i in range(3):
-                        plane[i] = u * corners[t, 0, i] + v * corners[t, 1, i] + w * corners[t, 2, i] - work[7, 0, i]
-                plane /= length
+                        plane[i] = -normals[t, 0, i]
+                else:
+                    _towards(corners, t, square, v, w, work[7, 0], plane)
                 other, other_rate, corner = _front(shapes, corner, pose, twist, plane, x, y, z, radius, work[6, 2])
                 gap = _low(corners, t, plane) - other
                 if gap > touch:
@@ -148,10 +138,19 @@ def patch_time(
             front, rate = far, pace
             floor = ENOUGH * best
             bar = front + spare + max(0.0, best * (rate + 0.5 * bend * best))
-            around = radius + spare + speed * best
-            around *= around
+            around = (radius + spare + speed * best) ** 2
         at += 1
     return best
+
+
+@njit(cache=True, error_model="numpy")
+def _towards(
+    corners: np.ndarray, t: int, square: float, v: float, w: float, center: np.ndarray, way: np.ndarray
+) -> None:
+    """Write the unit direction from a point to the one nearest to it of triangle t, as `to_triangle` tells that."""
+    u, length = 1.0 - v - w, np.sqrt(square)
+    for i in range(3):
+        way[i] = (u * corners[t, 0, i] + v * corners[t, 1, i] + w * corners[t, 2, i] - center[i]) / length
 
 
 @njit(cache=True, error_model="numpy")

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numba import njit
 
-from dexgrasp.distance import DistanceField, Field
+from dexgrasp.distance import DistanceField, Field, trilinear
 from dexgrasp.hand import Hand
 from dexgrasp.hand_body import HandBody, carry, hand_body, place_links
 
@@ -80,25 +80,11 @@ def _tip_speeds(hand: Hand, body: HandBody) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def _distance(grid: np.ndarray, frame: np.ndarray, x: float, y: float, z: float) -> float:
-    """Return about the signed distance at a point (m): trilinear in the grid, to the object's box outside.
+    """Return about the signed distance at a point (m); `frame` holds the object's box, then the grid's origin, spacing.
 
-    `frame` (10,) is the grid's origin and spacing and the object's box: small functions that take a whole `Field` or
-    `HandBody` spend most of their time counting references to its arrays.
+    Not by a `Field`: small functions that take a whole one spend most of their time counting references to its arrays.
     """
-    u, v, w = (x - frame[0]) / frame[3], (y - frame[1]) / frame[3], (z - frame[2]) / frame[3]
-    nx, ny, nz = grid.shape
-    if u < 0 or v < 0 or w < 0 or u > nx - 1 or v > ny - 1 or w > nz - 1:
-        dx = max(frame[4] - x, x - frame[7], 0.0)
-        dy = max(frame[5] - y, y - frame[8], 0.0)
-        dz = max(frame[6] - z, z - frame[9], 0.0)
-        return math.sqrt(dx * dx + dy * dy + dz * dz)
-    i, j, k = min(int(u), nx - 2), min(int(v), ny - 2), min(int(w), nz - 2)
-    u, v, w = u - i, v - j, w - k
-    low = (1 - v) * ((1 - w) * grid[i, j, k] + w * grid[i, j, k + 1])
-    low += v * ((1 - w) * grid[i, j + 1, k] + w * grid[i, j + 1, k + 1])
-    high = (1 - v) * ((1 - w) * grid[i + 1, j, k] + w * grid[i + 1, j, k + 1])
-    high += v * ((1 - w) * grid[i + 1, j + 1, k] + w * grid[i + 1, j + 1, k + 1])
-    return (1 - u) * low + u * high
+    return trilinear(grid, frame, frame[1, 0], frame[1, 1], frame[1, 2], frame[1, 3], x, y, z)
 
 
 @njit(cache=True, error_model="numpy")
@@ -203,7 +189,7 @@ def _trace(
 def _foot(grid: np.ndarray, frame: np.ndarray, at: np.ndarray, touch: np.ndarray) -> None:
     """Write the surface point below `at` and its normal, as the grid's slope tells them."""
     x, y, z = at[0], at[1], at[2]
-    h = 0.5 * frame[3]
+    h = 0.5 * frame[1, 3]
     u = _distance(grid, frame, x + h, y, z) - _distance(grid, frame, x - h, y, z)
     v = _distance(grid, frame, x, y + h, z) - _distance(grid, frame, x, y - h, z)
     w = _distance(grid, frame, x, y, z + h) - _distance(grid, frame, x, y, z - h)
@@ -225,8 +211,8 @@ def _look(
     limit: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     motions, balls, children, roots, centers = body.motions, body.balls, body.children, body.roots, body.tips
-    grid, frame = field.values, np.empty(10)
-    frame[:3], frame[3], frame[4:] = field.origin, field.spacing, field.tree.boxes[0]
+    grid, frame = field.values, np.empty((2, 6))
+    frame[0], frame[1, :3], frame[1, 3] = field.tree.boxes[0], field.origin, field.spacing
     count, fingers, movable = len(bases), len(body.tip_links), len(body.offset)
     status = np.zeros(count, np.int64)
     closed, touches = np.empty((count, movable)), np.full((count, fingers, 6), np.nan)

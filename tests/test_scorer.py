@@ -19,15 +19,6 @@ from dexgrasp.statistics import roc_area
 from dexgrasp.training import scoring
 from dexgrasp.training.scoring import ScorerSettings
 
-TINY = [
-    "dataset=smoke",
-    "dataset.objects.count=2",
-    "dataset.synthesis.target=100",
-    "dataset.synthesis.rounds=2",
-    "dataset.scenes.count=4",
-    "dataset.scenes.counts=[2]",
-    "dataset.views.framing.points=2048",
-]
 OPEN = Selection(depth=None, table=None)
 
 
@@ -114,12 +105,10 @@ def test_a_network_with_a_scorer_chooses_from_several_answers(tmp_path):
     assert torch.equal(again.pose, grasps.pose) and torch.equal(again.quality, grasps.quality)
 
 
-def test_it_learns_from_what_holds_and_leaves_the_network_as_it_is(tmp_path, monkeypatch):
+def test_it_learns_from_what_holds_and_leaves_the_network_as_it_is(tmp_path, monkeypatch, composed):
     """Dataset and network are real and small; what meets the cloud counts too, or an untrained network has nothing."""
     monkeypatch.setattr(scoring, "free", lambda hand, shape, grasps, *_: torch.ones(len(grasps), dtype=torch.bool))
-    settings.register()
-    with initialize_config_dir(str(settings.conf_folder()), version_base="1.3"):
-        config = compose("dataset", overrides=[*TINY, f"dataset.root={tmp_path / 'data'}"])
+    config = composed(tmp_path / "data")
     dataset = ensure(config.dataset, config.hand, config.repr)
     model = network(2048)
     save_model(tmp_path / "model.safetensors", model)
