@@ -22,7 +22,9 @@ install_import_hook(
 )
 
 from dexgrasp import geometry  # noqa: E402
+from dexgrasp.collision import HandShape  # noqa: E402
 from dexgrasp.hand import Finger, Hand  # noqa: E402
+from dexgrasp.plugins import load_hand  # noqa: E402
 
 torch.set_num_threads(1)
 
@@ -38,6 +40,18 @@ def shared() -> Path:
     if not folder.is_dir():
         pytest.skip(f"needs test data that is not here: {folder}")
     return folder
+
+
+@pytest.fixture(scope="session")
+def hand() -> Hand:
+    """The BarrettHand. Look, do not touch: `load_hand` gives one to change."""
+    return load_hand("barrett")
+
+
+@pytest.fixture(scope="session")
+def shape(hand: Hand) -> HandShape:
+    """What collides of `hand`."""
+    return HandShape(hand)
 
 
 @pytest.fixture(scope="session")
@@ -80,11 +94,20 @@ def composed():
 
 
 @pytest.fixture(scope="session")
-def tiny(tmp_path_factory: pytest.TempPathFactory, composed):
-    """Config and dataset of `TINY`, made by one process. Look, do not touch."""
+def common(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of this run of pytest, one for all its workers: xdist gives each a base folder of its own."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "common"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def tiny(common: Path, composed):
+    """Config and dataset of `TINY`, each shard made by one process. Look, do not touch."""
     from dexgrasp.dataset.pipeline import ensure
 
-    config = composed(tmp_path_factory.mktemp("tiny"), "dataset.workers=1")
+    config = composed(common / "tiny", "dataset.workers=1")
     return config, ensure(config.dataset, config.hand, config.repr)
 
 

@@ -24,11 +24,6 @@ PUBLIC = {
 
 
 @pytest.fixture(scope="module")
-def hand():
-    return load_hand("barrett")
-
-
-@pytest.fixture(scope="module")
 def cases(shared: Path) -> list[dict]:
     return json.loads((shared / "data" / "barrett" / "barrett_golden_fk.json").read_text())["cases"]
 

@@ -1,28 +1,15 @@
 """Hands clear of table, boxes and objects: against the exact distances of every step, and against meshes."""
 
 import numpy as np
-import pytest
 import torch
 import trimesh
 
-from dexgrasp import load_hand
 from dexgrasp.clearance import above_table, clear_way
-from dexgrasp.collision import HandShape
 from dexgrasp.distance import DistanceField
 from dexgrasp.geometry import inverse
 from dexgrasp.scene import Boxes, no_boxes
 
 RETREAT, MARGIN = 0.1, 0.002
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return load_hand("barrett")
-
-
-@pytest.fixture(scope="module")
-def shape(hand):
-    return HandShape(hand)
 
 
 def turned(count, seed, spread):

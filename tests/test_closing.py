@@ -7,17 +7,11 @@ import pytest
 import torch
 import trimesh
 
-from dexgrasp import load_hand
 from dexgrasp.ball_tree import ball_tree, inscribed_balls
 from dexgrasp.closing import Closer
 from dexgrasp.collision import HandShape
 from dexgrasp.contact_frame import tip_centers
 from dexgrasp.distance import DistanceField
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return load_hand("barrett")
 
 
 @pytest.fixture(scope="module")

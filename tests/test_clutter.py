@@ -5,7 +5,6 @@ import pytest
 import torch
 import trimesh
 
-from dexgrasp import load_hand
 from dexgrasp.collision import HandShape
 from dexgrasp.dataset.arrangement import Clutter, build_scene, place, separation
 from dexgrasp.dataset.clutter import Approach, approachable, feasible
@@ -22,11 +21,6 @@ from dexgrasp.simulation.mujoco import MujocoSimulator
 @pytest.fixture(scope="module")
 def objects() -> ObjectSet:
     return load_objects({"kind": "procedural", "split": "train", "count": 12, "seed": 0})
-
-
-@pytest.fixture(scope="module")
-def hand() -> Hand:
-    return load_hand("barrett")
 
 
 def test_separation_of_polygons() -> None:

@@ -5,19 +5,7 @@ import pytest
 import torch
 import trimesh
 
-from dexgrasp import load_hand
-from dexgrasp.collision import HandShape
 from dexgrasp.distance import DistanceField
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return load_hand("barrett")
-
-
-@pytest.fixture(scope="module")
-def shape(hand):
-    return HandShape(hand)
 
 
 def postures(hand, count, seed=0, spread=0.15):

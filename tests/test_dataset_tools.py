@@ -1,6 +1,7 @@
 """What one can do with a made dataset: open, look into, verify, merge and export it; its cost is foretold."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -39,11 +40,12 @@ Made = tuple[DictConfig, Dataset]
 
 
 @pytest.fixture
-def other(tiny: Made) -> Dataset:
-    """The same objects and scenes of another seed, quickly: grasps and scenes told in another order."""
-    config = tiny[0].copy()
+def other(tiny: Made, tmp_path: Path) -> Dataset:
+    """The same objects, with grasps and scenes of another seed."""
+    config, objects, root = tiny[0].copy(), tiny[1].folders["objects"], tmp_path / "other"
+    shutil.copytree(objects, root / objects.name)
     with open_dict(config):
-        config.dataset.seed = 1
+        config.dataset.seed, config.dataset.root = 1, str(root)
     return ensure(config.dataset, config.hand)
 
 

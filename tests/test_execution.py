@@ -2,18 +2,11 @@
 
 import math
 
-import pytest
 import torch
 
-import dexgrasp
 from dexgrasp.execution import closing_direction, pregrasp, tilted
 from dexgrasp.geometry import axis_angle, inverse, pose
 from dexgrasp.grasps import Grasps
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return dexgrasp.load_hand("barrett")
 
 
 def test_stands_back_along_the_palm_with_open_fingers(hand) -> None:

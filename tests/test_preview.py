@@ -5,7 +5,6 @@ import pytest
 import torch
 import trimesh
 
-from dexgrasp import load_hand
 from dexgrasp.closing import CLOSED, close_fingers
 from dexgrasp.collision import HandShape, as_arrays
 from dexgrasp.dataset.proposals import Contact
@@ -15,11 +14,6 @@ from dexgrasp.hand_body import hand_body
 from dexgrasp.headroom import headroom
 from dexgrasp.objects import Object
 from dexgrasp.preview import BURIED, SEEN, Preview
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return load_hand("barrett")
 
 
 @pytest.fixture(scope="module")

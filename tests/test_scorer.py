@@ -6,9 +6,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-import dexgrasp
 from dexgrasp import config as settings
-from dexgrasp.dataset.pipeline import ensure
 from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import axis_angle, pose
 from dexgrasp.grasps import Grasps
@@ -20,11 +18,6 @@ from dexgrasp.training import scoring
 from dexgrasp.training.scoring import ScorerSettings
 
 OPEN = Selection(depth=None, table=None)
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return dexgrasp.load_hand("barrett")
 
 
 def network(points: int) -> GraspNet:
@@ -105,12 +98,10 @@ def test_a_network_with_a_scorer_chooses_from_several_answers(tmp_path):
     assert torch.equal(again.pose, grasps.pose) and torch.equal(again.quality, grasps.quality)
 
 
-def test_it_learns_from_what_holds_and_leaves_the_network_as_it_is(tmp_path, monkeypatch, composed):
+def test_it_learns_from_what_holds_and_leaves_the_network_as_it_is(tmp_path, monkeypatch, tiny):
     """Dataset and network are real and small; what meets the cloud counts too, or an untrained network has nothing."""
     monkeypatch.setattr(scoring, "free", lambda hand, shape, grasps, *_: torch.ones(len(grasps), dtype=torch.bool))
-    config = composed(tmp_path / "data")
-    dataset = ensure(config.dataset, config.hand, config.repr)
-    model = network(2048)
+    dataset, model = tiny[1], network(2048)
     save_model(tmp_path / "model.safetensors", model)
     told = ScorerSettings(choices=2, most=200, per_view=60, epochs=2, batch=32)
     before = {key: value.clone() for key, value in model.state_dict().items()}

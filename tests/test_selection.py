@@ -5,24 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dexgrasp import load_hand
-from dexgrasp.collision import HandShape
 from dexgrasp.execution import pregrasp
 from dexgrasp.grasps import Grasps
 from dexgrasp.selection import Selection, free, select
 
 ALL = Selection(depth=None, table=None, distance=0.0)
 FAR = torch.tensor([[0.0, 0.0, 5.0]])
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return load_hand("barrett")
-
-
-@pytest.fixture(scope="module")
-def shape(hand):
-    return HandShape(hand)
 
 
 def above(hand, heights: list[float], quality: list[float] | None = None, bend: float = 0.8) -> Grasps:

@@ -29,11 +29,6 @@ SIMPLE = {"box": (BOX, 0.03), "cylinder": (CYLINDER, 0.05), "ball": (BALL, 0.03)
 
 
 @pytest.fixture(scope="module")
-def hand():
-    return dexgrasp.load_hand("barrett")
-
-
-@pytest.fixture(scope="module")
 def simulator() -> MujocoSimulator:
     return MujocoSimulator()
 

@@ -5,17 +5,11 @@ import pytest
 import torch
 import trimesh
 
-from dexgrasp import load_hand
 from dexgrasp.dataset.spread import coverage, distinct, spread
 from dexgrasp.dataset.surface import Surface
 from dexgrasp.distance import DistanceField
 from dexgrasp.grasps import Grasps
 from dexgrasp.objects import Object
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return load_hand("barrett")
 
 
 def grasps(positions, quality):

@@ -7,7 +7,6 @@ import pytest
 import torch
 import trimesh
 
-from dexgrasp import load_hand
 from dexgrasp.closing import Closer
 from dexgrasp.collision import HandShape
 from dexgrasp.contact_frame import place, project
@@ -27,11 +26,6 @@ SETTINGS = SynthesisSettings(batch=4096, rounds=6, target=150)
 
 def body(mesh: trimesh.Trimesh, name: str) -> Object:
     return Object(name, "test", mesh, (mesh.convex_hull,))
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return load_hand("barrett")
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ import trimesh
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-import dexgrasp
 from dexgrasp import config as settings
 from dexgrasp.collision import HandShape
 from dexgrasp.commands.dataset import tool
@@ -25,11 +24,6 @@ from dexgrasp.objects import Object
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import load_protocol
 from dexgrasp.statistics import roc_area, roc_curve
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return dexgrasp.load_hand("barrett")
 
 
 @pytest.fixture(scope="module")
