@@ -5,7 +5,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import torch
 import trimesh
@@ -87,17 +86,6 @@ def test_breakaway_golden_kinematics(hand, cases, tmp_path):
         assert golden_error(free.link_poses(joints), case) < 1e-9
         full = torch.tensor([[angles[name] for name in hand.full_joint_names]], dtype=torch.float64)
         assert golden_error(hand.full_link_poses(full), case) < 1e-9
-
-
-def test_torch_kinematics_equal_pinocchio(hand):
-    generator = torch.Generator().manual_seed(0)
-    joints = torch.rand(32, 4, dtype=torch.float64, generator=generator) * hand.limits[:, 1]
-    poses, data = hand.link_poses(joints), hand.model.createData()
-    for row, full in enumerate(hand.full_joints(joints).numpy()):
-        pin.framesForwardKinematics(hand.model, data, full)
-        for link in hand.link_names:
-            oracle = data.oMf[hand.model.getFrameId(link, pin.FrameType.BODY)].homogeneous
-            assert np.abs(oracle - poses[link][row].numpy()).max() < 1e-12
 
 
 def test_kinematics_pass_gradcheck_and_keep_dtype(hand):

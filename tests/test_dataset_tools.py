@@ -60,7 +60,7 @@ def test_opens_by_every_path(tiny: Made) -> None:
 
 def test_reads_without_simulator(tiny: Made) -> None:
     path = str(tiny[1].card.with_suffix(".json"))
-    done = subprocess.run([sys.executable, "-c", READER, path, ABSENT], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", READER, path, ABSENT], capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
 
 

@@ -41,7 +41,7 @@ def test_a_changed_callee_is_compiled_into_its_callers_anew(clean):
     for added in (1, 10):
         (package / "inner.py").write_text(INNER.format(added))
         done = subprocess.run(
-            [sys.executable, "-c", call], env=environment, capture_output=True, text=True, timeout=120
+            [sys.executable, "-c", call], env=environment, capture_output=True, text=True, timeout=600
         )
         assert done.stdout.split() == [str(1 + added)], done.stderr
     assert len(list((clean / "cache" / "dexgrasp" / "numba").iterdir())) == 3  # dexgrasp's own, and two states

@@ -9,6 +9,7 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import rotation_angle
 from dexgrasp.model import GraspNet, build_model, load_model, save_model
 from dexgrasp.selection import Selection
+from dexgrasp.testing.samples import seen
 
 BACKBONE = {
     "name": "pointnet2",
@@ -20,18 +21,6 @@ BACKBONE = {
     "stem": 8,
 }
 OPEN = Selection(depth=None, table=None)
-
-
-def scene(count: int = 1500, seed: int = 0) -> torch.Tensor:
-    """Balls on a table 0.6 m below the camera, visible halves only, camera frame."""
-    generator = torch.Generator().manual_seed(seed)
-    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
-    direction[:, 2] = -direction[:, 2].abs()
-    centres = torch.tensor([[0.0, 0.0, 0.56], [0.12, 0.05, 0.56], [-0.1, 0.08, 0.56]])
-    balls = centres[torch.randint(3, (count,), generator=generator)] + 0.04 * direction
-    table = torch.rand(count, 3, generator=generator) * torch.tensor([0.5, 0.5, 0.0])
-    table = table + torch.tensor([-0.25, -0.25, 0.6])
-    return torch.where(torch.rand(count, 1, generator=generator) < 0.5, balls, table)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +41,7 @@ def _yaml(kind: str, name: str) -> dict:
 
 
 def test_forward_flattens_the_batch_and_centres(model):
-    points = torch.stack([scene(800, 1), scene(800, 2)])
+    points = torch.stack([seen(800, 1), seen(800, 2)])
     cloud = torch.cat([points, torch.nn.functional.normalize(-points, dim=-1)], dim=-1)
     with torch.no_grad():
         prediction, seeds = model(cloud)
@@ -65,7 +54,7 @@ def test_forward_flattens_the_batch_and_centres(model):
 
 
 def test_predict_is_sorted_diverse_valid_and_repeatable(model):
-    points = scene()
+    points = seen(1500)
     grasps = model.predict(points, top_k=12, selection=OPEN)
     assert 1 <= len(grasps) <= 12
     assert (grasps.quality.diff() <= 0).all()
@@ -85,7 +74,7 @@ def test_predict_is_sorted_diverse_valid_and_repeatable(model):
 
 
 def test_predict_keeps_the_mode_and_takes_normals(model):
-    points = scene()
+    points = seen(1500)
     normals = torch.nn.functional.normalize(-points, dim=1)
     model.train()
     inward = model.predict(points, -3 * normals, top_k=5, selection=OPEN)
@@ -97,11 +86,11 @@ def test_predict_keeps_the_mode_and_takes_normals(model):
 @pytest.mark.parametrize(
     ("points", "told"),
     [
-        (scene(31), "at least 32 points"),
-        (scene() * 1000, "millimetres"),
-        (scene().index_fill(0, torch.tensor([3, 5]), float("nan")), "2 of 1500 rows with NaN"),
-        (scene().index_fill(0, torch.tensor([3]), float("inf")), "1 of 1500 rows"),
-        (scene().T, r"shape \(P, 3\)"),
+        (seen(31), "at least 32 points"),
+        (seen(1500) * 1000, "millimetres"),
+        (seen(1500).index_fill(0, torch.tensor([3, 5]), float("nan")), "2 of 1500 rows with NaN"),
+        (seen(1500).index_fill(0, torch.tensor([3]), float("inf")), "1 of 1500 rows"),
+        (seen(1500).T, r"shape \(P, 3\)"),
         (np.zeros((100, 3), dtype=bool), r"shape \(P, 3\)"),
         (np.zeros((0, 3)), "at least 32 points"),
     ],
@@ -112,7 +101,7 @@ def test_bad_clouds(model, points, told):
 
 
 def test_bad_normals(model):
-    points = scene()
+    points = seen(1500)
     for normals, told in ((torch.zeros_like(points), "non-zero"), (points[:-1], "one normal per point")):
         with pytest.raises(DexgraspError, match=told):
             model.predict(points, normals)
@@ -123,7 +112,7 @@ def test_save_and_load(model, tmp_path):
     save_model(path, model, {"seed": 3})
     loaded = dexgrasp.load_model(path.parent)
     assert not loaded.training and loaded.points == 1024
-    points = scene()
+    points = seen(1500)
     expected, found = (m.predict(points, top_k=5, selection=OPEN) for m in (model, loaded))
     assert torch.equal(expected.pose, found.pose)
     text = path.with_suffix(".json").read_text()

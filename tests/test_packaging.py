@@ -22,14 +22,14 @@ KINDS = {"hands": "hand", "representations": "repr", "backbones": "backbone"}
 def build(source, target, kind):
     target.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", str(target)]
-    done = subprocess.run(command, cwd=source, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, cwd=source, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
     return next(target.glob("*.whl" if kind == "wheel" else "*.tar.gz"))
 
 
 def pip(*arguments):
     command = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -42,7 +42,7 @@ def dexgrasp_in(sites, *arguments, cwd):
         "from dexgrasp.__main__ import main; sys.exit(main(sys.argv[2:]))"
     )
     command = [sys.executable, "-c", code, ":".join(map(str, sites)), *arguments]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120)
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=600)
 
 
 @pytest.fixture(scope="module")

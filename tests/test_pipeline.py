@@ -178,10 +178,10 @@ def test_interrupt_leaves_whole_shards_and_is_taken_up(
         [*command, "dataset.workers=2"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=tmp_path
     )
     started = time.monotonic()
-    while not list(tmp_path.rglob("grasps-*/shard-*.tar")) and run.poll() is None and time.monotonic() - started < 120:
+    while not list(tmp_path.rglob("grasps-*/shard-*.tar")) and run.poll() is None and time.monotonic() - started < 600:
         time.sleep(0.05)
     os.kill(run.pid, signal.SIGINT)
-    output = run.communicate(timeout=60)[0].decode()
+    output = run.communicate(timeout=600)[0].decode()
     assert run.returncode == 130, output
     assert not list(tmp_path.rglob("*.tmp"))
     config = composed(tmp_path / "data", "dataset.workers=1")
@@ -200,11 +200,11 @@ def test_every_backend_makes_the_same_dataset(backend: str, made: Made, tmp_path
 @pytest.mark.slow
 def test_killed_runs_are_taken_up(made: Made, tmp_path: Path, composed: Composed, tiny_overrides: list[str]) -> None:
     command = [sys.executable, "-m", "dexgrasp", "dataset", *tiny_overrides, f"dataset.root={tmp_path / 'data'}"]
-    for moment in np.random.default_rng(0).uniform(0.0, 1.0, 4):
+    for moment in np.random.default_rng(0).uniform(0.0, 1.0, 2):
         before = len(list(tmp_path.rglob("*.tar")))
         run = subprocess.Popen([*command, "dataset.workers=2"], stderr=subprocess.DEVNULL, cwd=tmp_path)
         started = time.monotonic()
-        while len(list(tmp_path.rglob("*.tar"))) == before and run.poll() is None and time.monotonic() - started < 120:
+        while len(list(tmp_path.rglob("*.tar"))) == before and run.poll() is None and time.monotonic() - started < 600:
             time.sleep(0.02)
         time.sleep(moment)
         os.kill(run.pid, signal.SIGKILL)
@@ -218,6 +218,6 @@ def test_jobs_of_a_cluster_make_one_dataset(made: Made, tmp_path: Path, tiny_ove
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     command = [sys.executable, "-m", "dexgrasp", "dataset", "-m", "part=range(0,2)", "parts=2"]
     command += ["hydra/launcher=submitit_local", f"dataset.root={tmp_path / 'data'}", "dataset.workers=1"]
-    done = subprocess.run([*command, *tiny_overrides], cwd=tmp_path, capture_output=True, text=True, timeout=280)
+    done = subprocess.run([*command, *tiny_overrides], cwd=tmp_path, capture_output=True, text=True, timeout=800)
     assert done.returncode == 0, done.stdout + done.stderr
     assert manifests(Dataset.open(tmp_path / "data")) == manifests(made[1])

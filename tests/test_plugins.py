@@ -78,7 +78,7 @@ def package(tmp_path, monkeypatch):
 def run(*arguments, cwd=None, path=()):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path))}
     return subprocess.run(
-        [sys.executable, *arguments], capture_output=True, text=True, cwd=cwd, env=environment, timeout=120
+        [sys.executable, *arguments], capture_output=True, text=True, cwd=cwd, env=environment, timeout=600
     )
 
 

@@ -14,6 +14,7 @@ from dexgrasp.model import GraspNet, build_model, load_model, save_model
 from dexgrasp.scorer import COARSE, NEAREST, Scorer, coarse_points, surroundings
 from dexgrasp.selection import Selection
 from dexgrasp.statistics import roc_area
+from dexgrasp.testing.samples import seen
 from dexgrasp.training import scoring
 from dexgrasp.training.scoring import ScorerSettings
 
@@ -37,20 +38,8 @@ def some(hand, count=5):
     return Grasps.build(pose(turned, 0.1 * torch.randn(count, 3, generator=generator)), joints, 3)
 
 
-def scene(count=1500, seed=0):
-    """Halves of balls on a table 0.6 m below the camera, camera frame."""
-    generator = torch.Generator().manual_seed(seed)
-    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
-    direction[:, 2] = -direction[:, 2].abs()
-    centres = torch.tensor([[0.0, 0.0, 0.56], [0.12, 0.05, 0.56], [-0.1, 0.08, 0.56]])
-    balls = centres[torch.randint(3, (count,), generator=generator)] + 0.04 * direction
-    table = torch.rand(count, 3, generator=generator) * torch.tensor([0.5, 0.5, 0.0])
-    table = table + torch.tensor([-0.25, -0.25, 0.6])
-    return torch.where(torch.rand(count, 1, generator=generator) < 0.5, balls, table)
-
-
 def cloud(count=1000):
-    points = scene(count, 4)
+    points = seen(count, 4)
     return torch.cat([points, torch.nn.functional.normalize(-points, dim=1)], dim=1)
 
 
@@ -83,7 +72,7 @@ def test_few_points_are_enough(hand):
 
 
 def test_a_network_with_a_scorer_chooses_from_several_answers(tmp_path):
-    model, points = network(1024), scene()
+    model, points = network(1024), seen(1500)
     plain = model.predict(points, top_k=500, selection=OPEN)
     torch.manual_seed(5)
     model.scorer = Scorer(model.hand, model.backbone.channels, choices=3, most=100).eval()

@@ -19,14 +19,7 @@ from safetensors.torch import load_file
 import dexgrasp
 from dexgrasp.dataset.store import Store
 
-TINY = [
-    "experiment=smoke",
-    "dataset.objects.count=2",
-    "dataset.synthesis.target=100",
-    "dataset.synthesis.rounds=2",
-    "dataset.scenes.count=4",
-    "dataset.scenes.counts=[2]",
-    "dataset.views.framing.points=2048",
+FEW = [
     "trainer.steps=20",
     "trainer.save_every=5",
     "trainer.processes=1",
@@ -36,6 +29,12 @@ TINY = [
     "evaluation.dataset.scenes.count=1",
     "evaluation.workers=1",
 ]
+
+
+@pytest.fixture(scope="session")
+def tiny_job(tiny_overrides: list[str]) -> list[str]:
+    """Overrides of a whole job that is done in a minute."""
+    return ["experiment=smoke", *tiny_overrides, *FEW]
 
 
 def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
@@ -49,15 +48,15 @@ def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
 
 def run(folder: Path, *arguments: str) -> tuple[int, str, str]:
     process = start(folder, *arguments)
-    out, err = process.communicate(timeout=250)
+    out, err = process.communicate(timeout=800)
     return process.returncode, out, err
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory: pytest.TempPathFactory, tiny_job: list[str]) -> Path:
     """The run's folder."""
     home = tmp_path_factory.mktemp("home")
-    status, out, err = run(home, "train", *TINY)
+    status, out, err = run(home, "train", *tiny_job)
     assert status == 0, out + err
     folder = Path(out.splitlines()[-1])
     assert folder.parent == home / "runs" / "train"
@@ -90,10 +89,10 @@ def test_the_model_loads_and_predicts(made: Path, tmp_path: Path) -> None:
     assert told["hand"] == "barrett" and told["joint_names"] == ["spread", "finger_1", "finger_2", "finger_3"]
 
 
-def test_a_killed_training_goes_on_to_the_same_weights(made: Path) -> None:
+def test_a_killed_training_goes_on_to_the_same_weights(made: Path, tiny_job: list[str]) -> None:
     home, folder = made.parents[2], made.parent / "killed"
-    process = start(home, "train", *TINY, "evaluate=false", f"hydra.run.dir={folder}")
-    until = time.monotonic() + 120
+    process = start(home, "train", *tiny_job, "evaluate=false", f"hydra.run.dir={folder}")
+    until = time.monotonic() + 600
     while not (folder / "training.safetensors").exists() and process.poll() is None and time.monotonic() < until:
         time.sleep(0.02)
     assert process.poll() is None, process.communicate()
@@ -109,10 +108,10 @@ def test_a_killed_training_goes_on_to_the_same_weights(made: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("data", [[], ["dataset.seed=1"]], ids=["same data", "other data"])
-def test_fine_tuning_starts_from_the_weights(made: Path, data: list[str]) -> None:
+def test_fine_tuning_starts_from_the_weights(made: Path, tiny_job: list[str], data: list[str]) -> None:
     home, folder = made.parents[2], made.parent / f"tuned{len(data)}"
     still = ["trainer.steps=1", "trainer.learning_rate=0.0", "evaluate=false"]
-    status, out, err = run(home, "train", *TINY, *still, *data, f"init_from={made}", f"hydra.run.dir={folder}")
+    status, out, err = run(home, "train", *tiny_job, *still, *data, f"init_from={made}", f"hydra.run.dir={folder}")
     assert status == 0, out + err
     before, after = load_file(made / "model.safetensors"), load_file(folder / "model.safetensors")
     measured = ("running_mean", "running_var", "num_batches_tracked")
@@ -123,11 +122,11 @@ def test_fine_tuning_starts_from_the_weights(made: Path, data: list[str]) -> Non
 
 
 @pytest.mark.slow
-def test_a_multirun_through_submitit_ends_with_one_table(made: Path) -> None:
+def test_a_multirun_through_submitit_ends_with_one_table(made: Path, tiny_job: list[str]) -> None:
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
-    words = ["train", "-m", "hydra/launcher=submitit_local", "repr=contact,pose", *TINY]
+    words = ["train", "-m", "hydra/launcher=submitit_local", "repr=contact,pose", *tiny_job]
     process = start(made.parents[2], *words)
-    out, err = process.communicate(timeout=400)
+    out, err = process.communicate(timeout=800)
     assert process.returncode == 0, out + err
     folder = Path(out.splitlines()[-1]).parent
     assert folder.name.endswith("_multirun") and out.count("# Comparison") == 1

@@ -4,13 +4,13 @@ from importlib.metadata import files
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import torch
 import trimesh
 
 from dexgrasp.errors import DexgraspError
 from dexgrasp.fingertip import fit_fingertip
+from dexgrasp.testing.hand_laws import kinematics_agree_with_pinocchio
 from dexgrasp.urdf import UrdfHand
 
 LIMIT = '<limit lower="0" upper="1" effort="2" velocity="1"/>'
@@ -71,14 +71,7 @@ def test_joints_stand_in_file_order_and_couplings_chain(tmp_path):
 
 
 def test_kinematics_equal_pinocchio(tmp_path):
-    hand = UrdfHand("two", two_fingers(tmp_path), FINGERS)
-    joints = torch.rand(16, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    poses, data = hand.link_poses(joints), hand.model.createData()
-    for row, full in enumerate(hand.full_joints(joints).numpy()):
-        pin.framesForwardKinematics(hand.model, data, full)
-        for name in hand.link_names:
-            oracle = data.oMf[hand.model.getFrameId(name, pin.FrameType.BODY)].homogeneous
-            assert np.abs(oracle - poses[name][row].numpy()).max() < 1e-12
+    kinematics_agree_with_pinocchio(UrdfHand("two", two_fingers(tmp_path), FINGERS))
 
 
 def test_closing_axis_follows_the_sign_of_closing(tmp_path):

@@ -1,16 +1,15 @@
 """Grasps verified by physics: what is stored is what physics says, and scenes are made of what lifts."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from dexgrasp import config as settings
 from dexgrasp.collision import HandShape
 from dexgrasp.commands.dataset import tool
 from dexgrasp.dataset.clutter import Approach
@@ -24,6 +23,8 @@ from dexgrasp.objects import Object
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import load_protocol
 from dexgrasp.statistics import roc_area, roc_curve
+
+Composed = Callable[..., DictConfig]
 
 
 @pytest.fixture(scope="module")
@@ -111,20 +112,13 @@ def test_wrong_settings_are_told(wrong: dict) -> None:
         VerifySettings(**wrong)
 
 
-def composed(root: Path, *overrides: str) -> DictConfig:
-    settings.register()
-    tiny = ["dataset=smoke", "dataset.objects.count=2", "dataset.synthesis.target=60", "dataset.synthesis.rounds=2"]
-    tiny += ["dataset.scenes.count=3", "dataset.scenes.counts=[2]", "dataset.views.per_scene=0", "dataset.workers=1"]
-    with initialize_config_dir(str(settings.conf_folder()), version_base="1.3"):
-        return compose("dataset", overrides=[*tiny, f"dataset.root={root}", *overrides])
-
-
+FEW = ["dataset.synthesis.target=60", "dataset.scenes.count=3", "dataset.views.per_scene=0", "dataset.workers=1"]
 VERIFIED = ["dataset.verify={protocol: lift-bulk-v1, per_object: 12, keep: lifted}", "dataset.scenes.lift_tests=4"]
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    config = composed(tmp_path_factory.mktemp("data"), *VERIFIED)
+def made(tmp_path_factory: pytest.TempPathFactory, composed: Composed) -> Dataset:
+    config = composed(tmp_path_factory.mktemp("data"), *FEW, *VERIFIED)
     return ensure(config.dataset, config.hand)
 
 
@@ -150,9 +144,9 @@ def test_scenes_are_made_of_what_lifts(made: Dataset, capsys: pytest.CaptureFixt
     assert "lifted by lift-bulk-v1 (version 1)" in printed
 
 
-def test_only_what_follows_from_verdicts_depends_on_them(tmp_path: Path) -> None:
+def test_only_what_follows_from_verdicts_depends_on_them(tmp_path: Path, composed: Composed) -> None:
     def names(*overrides: str) -> dict[str, str]:
-        config = composed(tmp_path, *overrides)
+        config = composed(tmp_path, *FEW, *overrides)
         return {stage: folder.name for stage, _, folder in plan(plain(config.dataset), plain(config.hand), None)}
 
     without, verified = names(), names(VERIFIED[0])
@@ -164,8 +158,8 @@ def test_only_what_follows_from_verdicts_depends_on_them(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_any_number_of_workers_gives_the_same_bytes(made: Dataset, tmp_path: Path) -> None:
-    config = composed(tmp_path, *VERIFIED, "dataset.workers=2")
+def test_any_number_of_workers_gives_the_same_bytes(made: Dataset, tmp_path: Path, composed: Composed) -> None:
+    config = composed(tmp_path, *FEW, *VERIFIED, "dataset.workers=2")
     again = ensure(config.dataset, config.hand)
     for stage in ("verdicts", "scenes"):
         sums = [

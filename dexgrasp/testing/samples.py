@@ -62,5 +62,17 @@ def cloud(batch: int, points: int, seed: int = 0) -> Float[Tensor, "B N 6"]:
     return torch.cat([torch.cat([table, up], dim=-1), torch.cat([balls, outward], dim=-1)], dim=1)
 
 
+def seen(count: int, seed: int = 0) -> Float[Tensor, "N 3"]:
+    """Return what a camera sees of a table 0.6 m below it and of the near halves of three balls on it, m, float32."""
+    generator = _generator(seed)
+    direction = normalize(torch.randn(count, 3, generator=generator), dim=1)
+    direction[:, 2] = -direction[:, 2].abs()
+    centers = torch.tensor([[0.0, 0.0, 0.56], [0.12, 0.05, 0.56], [-0.1, 0.08, 0.56]])
+    balls = centers[torch.randint(3, (count,), generator=generator)] + 0.04 * direction
+    table = torch.rand(count, 3, generator=generator) * torch.tensor([0.5, 0.5, 0.0])
+    table = table + torch.tensor([-0.25, -0.25, 0.6])
+    return torch.where(torch.rand(count, 1, generator=generator) < 0.5, balls, table)
+
+
 def _generator(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
