@@ -19,6 +19,8 @@ from safetensors.torch import load_file
 import dexgrasp
 from dexgrasp.dataset.store import Store
 
+pytestmark = pytest.mark.timeout(1800)
+
 FEW = [
     "trainer.steps=20",
     "trainer.save_every=5",
@@ -48,7 +50,7 @@ def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
 
 def run(folder: Path, *arguments: str) -> tuple[int, str, str]:
     process = start(folder, *arguments)
-    out, err = process.communicate(timeout=800)
+    out, err = process.communicate(timeout=1500)
     return process.returncode, out, err
 
 
@@ -92,7 +94,7 @@ def test_the_model_loads_and_predicts(made: Path, tmp_path: Path) -> None:
 def test_a_killed_training_goes_on_to_the_same_weights(made: Path, tiny_job: list[str]) -> None:
     home, folder = made.parents[2], made.parent / "killed"
     process = start(home, "train", *tiny_job, "evaluate=false", f"hydra.run.dir={folder}")
-    until = time.monotonic() + 600
+    until = time.monotonic() + 1200
     while not (folder / "training.safetensors").exists() and process.poll() is None and time.monotonic() < until:
         time.sleep(0.02)
     assert process.poll() is None, process.communicate()
@@ -126,7 +128,7 @@ def test_a_multirun_through_submitit_ends_with_one_table(made: Path, tiny_job: l
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     words = ["train", "-m", "hydra/launcher=submitit_local", "repr=contact,pose", *tiny_job]
     process = start(made.parents[2], *words)
-    out, err = process.communicate(timeout=800)
+    out, err = process.communicate(timeout=1500)
     assert process.returncode == 0, out + err
     folder = Path(out.splitlines()[-1]).parent
     assert folder.name.endswith("_multirun") and out.count("# Comparison") == 1
