@@ -1,12 +1,13 @@
-"""Whole scenes per minute and core, without physics per grasp, and where their time goes.
+"""Whole scenes per minute and core, with or without physics per grasp, and where their time goes.
 
-    python -m benchmarks.scenes [--data FOLDER] [--objects 24] [--scenes 12] [--rounds 5] [--arrangement table]
-        [--per-object 3000] [--camera d435] [--views 1] [--sample 40] [--json results.json]
+    python -m benchmarks.scenes [--data FOLDER] [--objects 24] [--scenes 12] [--rounds 5] [--arrangement table ...]
+        [--per-object 3000] [--camera d435] [--views 1] [--fused 1] [--lift-tests 0] [--sample 40] [--json results.json]
 
 A scene is what the stages `scenes` and `views` do for one: five objects drawn and laid out, settled by physics, their
 grasps checked against table, walls and neighbours (closed, and opened along the whole approach), one view rendered,
-measured, cropped and thinned to 8,192 points with estimated normals. Writing shards is not in it; objects, their
-grasps and distance fields are there before (made once per object; the first run makes them in FOLDER).
+measured, cropped and thinned to 8,192 points with estimated normals; with `--lift-tests 100`, that many of its feasible
+grasps are also lifted in it. Writing shards is not in it; objects, their grasps and distance fields are there before
+(made once per object; the first run makes them in FOLDER). Several arrangements take turns, a row each.
 
 The reference does the same in the way of common tools, part by part in turn with ours: python-fcl collides the hand's
 convex parts with the meshes in the closed posture and at five places of the approach (on `--sample` grasps a scene, as
@@ -17,8 +18,9 @@ alone, scipy's trees find the neighbours of which the normals are fitted. It set
 import argparse
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import fcl
@@ -28,7 +30,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from benchmarks.interleaved import compare, record
+from benchmarks.interleaved import Comparison, compare, record
 from dexgrasp import config as settings
 from dexgrasp.dataset import arrangement, sensor, stages
 from dexgrasp.dataset.camera import MeshScene
@@ -50,6 +52,7 @@ STEPS = {
     "measure": (sensor.Sensor, ("measure",)),
     "thin": (sensor, ("downsample",)),
     "normals": (sensor, ("depth_normals",)),
+    "lift tests": (stages, ("_lifted",)),
 }
 """What is timed within a scene: where it is looked up, and by which names."""
 
@@ -80,8 +83,8 @@ def stopwatch(spent: dict[str, float]) -> Any:
             setattr(home, name, inner)
 
 
-def prepare(args: argparse.Namespace) -> Dataset:
-    """Return a dataset whose objects, grasps, scenes and views are made."""
+def prepare(args: argparse.Namespace, arrangement: str, known: Sequence[Dataset]) -> Dataset:
+    """Return a dataset whose objects, grasps, scenes and views are made, without lift tests."""
     settings.register()
     overrides = [
         f"dataset.root={args.data}",
@@ -90,8 +93,9 @@ def prepare(args: argparse.Namespace) -> Dataset:
         f"dataset.scenes.grasps_per_object={args.per_object}",
         f"dataset.scenes.count={args.scenes}",
         "dataset.scenes.counts=[5]",
-        f"dataset.scenes.arrangement={args.arrangement}",
+        f"dataset.scenes.arrangement={arrangement}",
         f"dataset.views.per_scene={args.views}",
+        f"dataset.views.fused={args.fused}",
         f"camera@dataset.camera={args.camera}",
         "dataset.workers=1",
     ]
@@ -99,9 +103,19 @@ def prepare(args: argparse.Namespace) -> Dataset:
         config = compose("dataset", overrides=overrides)
     OmegaConf.resolve(config)
     dataset = ensure(config.dataset, config.hand)
+    for other in known:
+        dataset.adopt(other)
     for number in range(len(dataset.objects)):
         dataset.field(number)
     return dataset
+
+
+def lifting(dataset: Dataset, tests: int) -> Dataset:
+    """Return the dataset with so many lift tests in each scene; it shares what is kept in memory."""
+    scenes = {**dataset.config["scenes"], "lift_tests": tests}
+    changed = Dataset({**dataset.config, "scenes": scenes}, dataset.hand_config, dataset.folders)
+    changed.adopt(dataset)
+    return changed
 
 
 def ours(dataset: Dataset, scenes: int) -> int:
@@ -230,68 +244,86 @@ def view_reference(dataset: Dataset, scenes: int) -> int:
     return scenes
 
 
+def steps(dataset: Dataset, scenes: int) -> dict[str, float]:
+    """Return the CPU time of each step of a scene, ms."""
+    spent: dict[str, float] = defaultdict(float)
+    began = time.process_time()
+    with stopwatch(spent):
+        ours(dataset, scenes)
+    spent["all else"] = time.process_time() - began - sum(spent.values())
+    return {step: 1e3 * seconds / scenes for step, seconds in spent.items()}
+
+
+def whole_reference(found: Comparison, scene: str, checked: float, views: int) -> float:
+    """Return the scenes a second of the reference: its parts in place of ours, and what both have in common."""
+    common = 1 / found.rates[scene].median - checked / found.rates["static check"].median
+    common -= views / found.rates["view"].median
+    slow = checked / found.rates["static check, python-fcl"].median
+    return 1 / (common + slow + views / found.rates["view, embree and scipy"].median)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", default="data/benchmark", help="folder for objects and grasps, found again")
     parser.add_argument("--objects", type=int, default=24)
     parser.add_argument("--scenes", type=int, default=12)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--arrangement", default="table")
+    parser.add_argument("--arrangement", nargs="+", default=["table"], help="table, packed, pile, bin")
     parser.add_argument("--per-object", type=int, default=3000, help="grasps of each object at most")
     parser.add_argument("--camera", default="d435")
     parser.add_argument("--views", type=int, default=1, help="a scene")
+    parser.add_argument("--fused", type=int, default=1, help="viewpoints of a view")
+    parser.add_argument("--lift-tests", type=int, default=0, help="a scene; with and without them take turns")
+    parser.add_argument("--ours", action="store_true", help="leave the reference out")
     parser.add_argument("--sample", type=int, default=40, help="grasps a scene that python-fcl checks")
     parser.add_argument("--json")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    dataset = prepare(args)
-    grasps = [tried(dataset, index) for index in range(args.scenes)]
-    models = models_of(dataset)
-    found = compare(
-        {
-            "scene": lambda: ours(dataset, args.scenes),
-            "static check": lambda: check_ours(dataset, grasps),
-            "static check, python-fcl": lambda: check_fcl(dataset, grasps, args.sample, models),
-            "view": lambda: view_ours(dataset, args.scenes),
-            "view, embree and scipy": lambda: view_reference(dataset, args.scenes),
-        },
-        args.rounds,
-    )
-    spent: dict[str, float] = defaultdict(float)
-    began = time.process_time()
-    with stopwatch(spent):
-        ours(dataset, args.scenes)
-    whole = time.process_time() - began
-    spent["all else"] = whole - sum(spent.values())
-    checked = sum(map(len, grasps)) / args.scenes
-    rate = 60 * found.rates["scene"].median
-    rest = 1 / found.rates["scene"].median - checked / found.rates["static check"].median
-    rest -= args.views / found.rates["view"].median
-    slow = checked / found.rates["static check, python-fcl"].median
-    slow += rest + args.views / found.rates["view, embree and scipy"].median
-    print(f"{args.arrangement}: {rate:.0f} scenes/min/core ({60 * found.rates['scene'].low:.0f} to", end=" ")
-    print(f"{60 * found.rates['scene'].high:.0f}), {checked:.0f} grasps checked and {args.views} view(s) a scene")
-    print(f"the reference's parts add up to {60 / slow:.2f} scenes/min/core")
-    for part, reference, unit in (
-        ("static check", "static check, python-fcl", "grasps/s"),
-        ("view", "view, embree and scipy", "views/s"),
-    ):
-        ratio, low, high = found.ratio(part, reference)
-        rates = found.rates[part].median, found.rates[reference].median
-        print(
-            f"{part:14}{rates[0]:12,.1f} {unit}; reference {rates[1]:,.1f}; ratio {ratio:.1f} ({low:.1f} to {high:.1f})"
-        )
-    print(f"{'step':22}{'ms a scene':>12}{'share':>8}")
-    for step, seconds in spent.items():
-        print(f"{step:22}{1e3 * seconds / args.scenes:12.1f}{seconds / whole:8.0%}")
-    figures = {
-        "scenes_per_minute": rate,
-        "reference_scenes_per_minute": 60 / slow,
+    datasets: dict[str, Dataset] = {}
+    for name in args.arrangement:
+        datasets[name] = prepare(args, name, list(datasets.values()))
+    grasps = {name: [tried(each, index) for index in range(args.scenes)] for name, each in datasets.items()}
+    if args.lift_tests:
+        datasets |= {f"{name}, {args.lift_tests} lifts": lifting(datasets[name], args.lift_tests) for name in grasps}
+    variants = {name: partial(ours, each, args.scenes) for name, each in datasets.items()}
+    first = args.arrangement[0]
+    if not args.ours:
+        models, sample = models_of(datasets[first]), args.sample
+        variants |= {
+            "static check": partial(check_ours, datasets[first], grasps[first]),
+            "static check, python-fcl": partial(check_fcl, datasets[first], grasps[first], sample, models),
+            "view": partial(view_ours, datasets[first], args.scenes),
+            "view, embree and scipy": partial(view_reference, datasets[first], args.scenes),
+        }
+    found = compare(variants, args.rounds)
+    spent = {name: steps(each, args.scenes) for name, each in datasets.items()}
+    checked = {name: sum(map(len, each)) / args.scenes for name, each in grasps.items()}
+    print(f"{'':20}{'scenes/min/core':>16}{'least':>8}{'most':>8}{'views/min':>11}{'grasps checked':>16}")
+    for name in datasets:
+        low, rate, high = (60 * getattr(found.rates[name], kind) for kind in ("low", "median", "high"))
+        numbers = f"{args.views * rate:11.1f}{checked[name.partition(',')[0]]:16.0f}"
+        print(f"{name:20}{rate:16.1f}{low:8.1f}{high:8.1f}{numbers}")
+    figures: dict[str, Any] = {
+        "scenes_per_minute": {name: 60 * found.rates[name].median for name in datasets},
         "grasps_checked_per_scene": checked,
-        "ms_per_scene": {step: 1e3 * seconds / args.scenes for step, seconds in spent.items()},
+        "ms_per_scene": spent,
         "comparison": found,
         "settings": vars(args),
     }
+    if not args.ours:
+        slow = 60 * whole_reference(found, first, checked[first], args.views)
+        figures["reference_scenes_per_minute"] = slow
+        print(f"the reference's parts add up to {slow:.2f} scenes/min/core ({first})")
+        for part, reference, unit in (
+            ("static check", "static check, python-fcl", "grasps/s"),
+            ("view", "view, embree and scipy", "views/s"),
+        ):
+            ratio, low, high = found.ratio(part, reference)
+            own, theirs = found.rates[part].median, found.rates[reference].median
+            print(f"{part:14}{own:12,.1f} {unit}; reference {theirs:,.1f}; ratio {ratio:.1f} ({low:.1f} to {high:.1f})")
+    print(f"{'ms a scene':22}" + "".join(f"{name:>18}" for name in datasets))
+    for step in (*STEPS, "all else"):
+        print(f"{step:22}" + "".join(f"{each.get(step, 0.0):18.1f}" for each in spent.values()))
     print(record("scenes", figures, args.json))
 
 

@@ -12,7 +12,7 @@ import torch
 from omegaconf import DictConfig, open_dict
 
 from dexgrasp.commands.dataset import tool
-from dexgrasp.dataset import synthesis_sample
+from dexgrasp.dataset import estimation
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.estimation import estimate
 from dexgrasp.dataset.merging import merge
@@ -210,7 +210,7 @@ def test_estimate_foretells_every_stage(tiny: Made, tmp_path: Path, monkeypatch:
         assert row.bytes == pytest.approx(true, rel=0.25, abs=10_240 * len(shards)), row
         assert row.seconds > 0
     assert not (tmp_path / "new").exists(), "nothing is left"
-    monkeypatch.setattr(synthesis_sample, "LOOKED_AT", 1)
+    monkeypatch.setattr(estimation, "ITEMS", 1)
     fewer = estimate(config.dataset, config.hand, config.repr, 5.0)
-    assert [row.items for row in fewer[1:]] == [2, 2, 4, 4, 4] and "1 of 2 objects" in fewer[2].basis
+    assert [row.items for row in fewer[1:]] == [2, 2, 4, 4, 4] and fewer[2].basis.startswith("1 of 2, ")
     assert all(row.basis == "made already" for row in estimate(tiny[0].dataset, tiny[0].hand, tiny[0].repr))

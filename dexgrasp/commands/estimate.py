@@ -1,6 +1,7 @@
 """python -m dexgrasp dataset estimate: time and disk of a dataset, from a small sample of every stage."""
 
 import json
+import math
 import time
 from pathlib import Path
 
@@ -9,8 +10,9 @@ from omegaconf import DictConfig
 
 from dexgrasp.dataset.estimation import Predicted, estimate
 
-SCHEMA = 1
-"""Of results.json: {schema, command, took, seconds, bytes, stages: [{stage, items, seconds, bytes, basis, idle}]}."""
+SCHEMA = 2
+"""Of results.json: {schema, command, took, seconds, bytes, idle, error, stages: [{stage, items, seconds, bytes, basis,
+idle, error}]}; `error` is one standard error of `seconds`."""
 BUSY = 0.85
 """Where the sample had a smaller share than this of its cores, the estimate for idle ones is told too."""
 
@@ -23,7 +25,8 @@ def main(config: DictConfig) -> None:
     print(table(rows))
     print(f"measured in {took:.0f} s")
     run = Path(HydraConfig.get().runtime.output_dir)
-    total = {"seconds": sum(row.seconds for row in rows), "bytes": sum(row.bytes for row in rows), "took": took}
+    total = {name: sum(getattr(row, name) for row in rows) for name in ("seconds", "bytes", "idle")}
+    total |= {"took": took, "error": math.hypot(*(row.error for row in rows))}
     content = {"schema": SCHEMA, "command": "estimate", **total, "stages": [vars(row) for row in rows]}
     (run / "results.json").write_text(json.dumps(content, indent=1))
     print(run)
@@ -31,11 +34,19 @@ def main(config: DictConfig) -> None:
 
 def table(rows: list[Predicted]) -> str:
     """Return the estimate as text."""
-    lines = [f"{'stage':10}{'items':>8}{'time':>11}{'disk':>12}  measured on"]
-    lines += [f"{row.stage:10}{row.items:8d}{row.seconds:9.0f} s{row.bytes / 1e6:9.1f} MB  {row.basis}" for row in rows]
+    lines = [f"{'stage':10}{'items':>8}{'time':>11}{'+-':>6}{'disk':>12}  measured on"]
+    lines += [
+        f"{row.stage:10}{row.items:8d}{row.seconds:9.0f} s{2 * row.error:6.0f}{row.bytes / 1e6:9.1f} MB  {row.basis}"
+        for row in rows
+    ]
     seconds, size = sum(row.seconds for row in rows), sum(row.bytes for row in rows)
-    lines.append(f"{'in all':18}{seconds:9.0f} s{size / 1e6:9.1f} MB  {seconds / 60:.1f} min, {size / 1e9:.2f} GB")
+    error = 2 * math.hypot(*(row.error for row in rows))
+    told = f"{seconds / 60:.1f} min, {size / 1e9:.2f} GB"
+    lines.append(f"{'in all':18}{seconds:9.0f} s{error:6.0f}{size / 1e6:9.1f} MB  {told}")
+    if seconds:
+        share = f"{100 * error / seconds:.0f} %"
+        lines.append(f"+- two standard errors: expect the time within {share} as long as the machine is as busy as now")
     idle = sum(row.idle for row in rows)
     if idle < BUSY * seconds:
-        lines.append(f"the cores were busy with other work; had they been idle: {idle:.0f} s")
+        lines.append(f"the cores were busy with other work; had they been idle: {idle:.0f} s ({idle / 60:.1f} min)")
     return "\n".join(lines)

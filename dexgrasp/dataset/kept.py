@@ -24,16 +24,16 @@ class Kept(Generic[T]):
         self._values: OrderedDict[int, tuple[T, int]] = OrderedDict()
         self.bytes = 0
         """Of all values kept now."""
-        self.times: list[float] = []
-        """What each call of `make` took, s."""
+        self.made: list[tuple[float, int]] = []
+        """What each call of `make` took, s of this thread's processor time, and the bytes of its value."""
 
     def __call__(self, key: int) -> T:
         if key in self._values:
             self._values.move_to_end(key)
             return self._values[key][0]
-        began = time.perf_counter()
+        began = time.thread_time()
         value = self.make(key)
-        self.times.append(time.perf_counter() - began)
+        self.made.append((time.thread_time() - began, size(value)))
         self._values[key] = value, size(value)
         self.bytes += size(value)
         while self.bytes > self.limit and len(self._values) > 1:
