@@ -3,14 +3,14 @@
 h(u), how far the hull reaches along any unit u, bounds epsilon from above; the smallest signed facet distance of any
 polytope inside the hull bounds it from below. The polytope grows only at the facet nearest the origin until both
 bounds meet, so most facets of the whole hull are never built. Its lists are flat and reused from set to set: facet f
-has its plane at planes[8 f] (unit outward normal, signed distance of the origin, height of the point being added) and
-its links at links[16 f] (6 corners, the facets across from them, state). Loops avoid branches that depend on data.
+has its plane at planes[8 f] (unit outward normal, signed distance of the origin, height of the point being added), its
+6 corners and state at links[16 f] and the 6 facets across from the corners at links[16 f + 8]: rows of 8 are moved at
+once. Loops avoid branches that depend on data.
 """
 
 import numpy as np
 from numba import njit
 
-from dexgrasp.heap import pop, push
 from dexgrasp.wrench_support import (
     DIM,
     ZERO,
@@ -30,8 +30,8 @@ A set that is torn by rounding all the same is done again with ten times as much
 COARSEST = 1e-7
 GENERIC = 1e-13
 """The same for volumes of L1 hulls: every facet counts, and wrenches are in general position."""
-DISTANCE, EDGE, STATE = 6, 6, 12
-"""Columns: a plane's distance, the facets across, whether a facet is gone (odd)."""
+DISTANCE, HEIGHT, STATE, EDGE = 6, 7, 6, 8
+"""Columns: a plane's distance and the height above it; whether a facet is gone (odd), the facets across."""
 SIZE, DECIDE, FACET, VOLUME = range(4)
 """What is wanted: epsilon, whether it reaches the threshold, epsilon and its facet, the volume of the whole hull."""
 ONCE, TWICE = np.uint32(1 << 24), np.uint32(1 << 25)
@@ -60,7 +60,7 @@ def evaluate(
         # On a set that needs more room than there is, start over with twice as much.
         planes, links, hashes = np.empty(8 * room), np.empty(16 * room, np.uint32), np.empty(room, np.uint64)
         keys, items = np.empty(room), np.empty(room, np.uint32)
-        visible, ridges = np.empty(room, np.uint32), np.empty(2 * room, np.uint32)
+        visible, ridges = np.empty(room, np.uint32), np.empty(room, np.uint32)
         table, pairs = np.empty(32 * room, np.uint64), np.empty(32 * room, np.uint32)
         corners, words, named = np.empty((room, DIM)), random_words(room), np.empty(room, np.int64)
         room *= 2
@@ -115,18 +115,31 @@ def _grow(
     words: np.ndarray, named: np.ndarray, wrenches: np.ndarray, contacts: int, values: np.ndarray,
     threshold: float, wanted: int, tolerance: float, normal: np.ndarray, names: np.ndarray,
 ) -> float:  # fmt: skip
-    count, apex, turn, heap = DIM + 1, DIM, 0, 0
+    count, apex, turn, left = DIM + 1, DIM, 0, DIM + 1
     for f in range(DIM + 1):
-        heap = push(keys, items, heap, planes[8 * f + DISTANCE], np.uint32(f))
+        keys[f], items[f] = planes[8 * f + DISTANCE], f
     upper = np.inf
     while True:
-        while heap > 0 and links[16 * items[0] + STATE] & 1:
-            heap = pop(keys, items, heap)
-        if heap == 0:
+        # The nearest of the facets that are still there, less those already as far as the hull reaches somewhere. A
+        # pass over the few that are left costs less than a heap, most of whose facets are gone before their turn.
+        lower, facet = np.inf, np.uint32(0)
+        if wanted == VOLUME:
+            while left > 0 and lower == np.inf:
+                left -= 1
+                if links[16 * items[left] + STATE] & 1 == 0:
+                    facet, lower = items[left], keys[left]
+        else:
+            number, left = left, 0
+            for i in range(number):
+                f, key = items[i], keys[i]
+                items[left], keys[left] = f, key
+                there = (links[16 * f + STATE] & 1 == 0) & (key < upper)
+                left += there
+                nearer = there & (key < lower)
+                facet = f if nearer else facet
+                lower = key if nearer else lower
+        if lower == np.inf:
             break
-        facet = items[0]
-        heap = pop(keys, items, heap)
-        lower = planes[8 * facet + DISTANCE]
         if wanted != VOLUME and lower >= upper - tolerance:
             upper = min(lower, upper)
             break
@@ -156,7 +169,7 @@ def _grow(
         seen, head, horizon = 1, 0, 0
         visible[0] = facet
         links[16 * facet + STATE] = turn + 1
-        planes[8 * facet + 7] = reach - lower
+        planes[8 * facet + HEIGHT] = reach - lower
         while head < seen:
             f = visible[head]
             head += 1
@@ -165,9 +178,9 @@ def _grow(
             for k in range(DIM):
                 g = links[16 * f + EDGE + k]
                 height = dot(plane(planes, g), p) - planes[8 * g + DISTANCE]
-                planes[8 * g + 7] = height
+                planes[8 * g + HEIGHT] = height
                 sees = height > tolerance
-                ridges[2 * horizon], ridges[2 * horizon + 1] = f, k
+                ridges[horizon] = 16 * f + k
                 horizon += 1 - sees
                 visible[seen] = g
                 seen += sees & (links[16 * g + STATE] != turn + 1)
@@ -176,19 +189,22 @@ def _grow(
             return FULL
 
         # A new plane goes through ridge and apex: it is of the pencil of the two planes that meet at the ridge.
+        thin = False
         for r in range(horizon):
-            new, f = np.uint32(count + r), ridges[2 * r]
-            g = links[16 * f + EDGE + ridges[2 * r + 1]]
-            a, b, x, y = planes[8 * f + 7], planes[8 * g + 7], plane(planes, g), plane(planes, f)
+            new, f = np.uint32(count + r), ridges[r] >> 4
+            g = links[ridges[r] + EDGE]
+            a, b, x, y = planes[8 * f + HEIGHT], planes[8 * g + HEIGHT], plane(planes, g), plane(planes, f)
             b = b if b < -tolerance else 0.0
             n0, n1, n2 = a * x[0] - b * y[0], a * x[1] - b * y[1], a * x[2] - b * y[2]
             n3, n4, n5 = a * x[3] - b * y[3], a * x[4] - b * y[4], a * x[5] - b * y[5]
             x = n0, n1, n2, n3, n4, n5
-            scale, at = 1.0 / np.sqrt(dot(x, x)), 8 * new
-            if scale * tolerance > 1.0:
-                return TORN
+            size, at = dot(x, x), 8 * new
+            thin |= size < tolerance * tolerance
+            scale = 1.0 / np.sqrt(size)
             planes[at], planes[at + 1], planes[at + 2], planes[at + 3] = n0 * scale, n1 * scale, n2 * scale, n3 * scale
             planes[at + 4], planes[at + 5], planes[at + DISTANCE] = n4 * scale, n5 * scale, dot(x, p) * scale
+        if thin:
+            return TORN
 
         # Two new facets meet where all corners but one are the same: their numbers meet in one cell of a hash table.
         cells = 64
@@ -197,23 +213,24 @@ def _grow(
         mask = np.uint64(cells - 1)
         table[:cells], pairs[:cells] = 0, 0
         for r in range(horizon):
-            new, f, k = np.uint32(count + r), ridges[2 * r], ridges[2 * r + 1]
-            g = links[16 * f + EDGE + k]
-            code = hashes[f] ^ words[links[16 * f + k]] ^ words[apex]
-            hashes[new] = code
-            for j in range(DIM):
-                links[16 * new + j] = links[16 * f + j]
-                links[16 * g + EDGE + j] = new if links[16 * g + EDGE + j] == f else links[16 * g + EDGE + j]
-            links[16 * new + k] = links[16 * f + DIM - 1]
-            links[16 * new + DIM - 1], links[16 * new + EDGE + DIM - 1], links[16 * new + STATE] = apex, g, 0
+            new, f, k = 16 * np.uint32(count + r), ridges[r] & ~np.uint32(15), ridges[r] & np.uint32(15)
+            g = 16 * links[f + EDGE + k]
+            code = hashes[f >> 4] ^ words[links[f + k]] ^ words[apex]
+            hashes[count + r] = code
+            for j in range(8):
+                links[new + j] = links[f + j]
+            for j in range(8):
+                links[g + EDGE + j] = new >> 4 if links[g + EDGE + j] == f >> 4 else links[g + EDGE + j]
+            links[new + k] = links[f + DIM - 1]
+            links[new + DIM - 1], links[new + EDGE + DIM - 1], links[new + STATE] = apex, g >> 4, 0
             for j in range(DIM - 1):
-                key = code ^ words[links[16 * new + j]]
+                key = code ^ words[links[new + j]]
                 cell = key & mask
                 while (table[cell] != key) & (table[cell] != 0):
                     cell = (cell + np.uint64(1)) & mask
                 table[cell] = key
-                pairs[cell] = (pairs[cell] + ONCE) ^ new
-                links[16 * new + EDGE + j] = np.uint32(cell)
+                pairs[cell] = (pairs[cell] + ONCE) ^ (new >> 4)
+                links[new + EDGE + j] = np.uint32(cell)
         odd = np.uint32(0)
         for r in range(horizon):
             new = np.uint32(count + r)
@@ -221,8 +238,8 @@ def _grow(
                 across = pairs[links[16 * new + EDGE + j]] ^ new ^ TWICE
                 links[16 * new + EDGE + j] = across
                 odd |= across
-            if planes[8 * new + DISTANCE] < upper:
-                heap = push(keys, items, heap, planes[8 * new + DISTANCE], new)
+            items[left], keys[left] = new, planes[8 * new + DISTANCE]
+            left += keys[left] < upper
         if odd >= ONCE:
             return TORN
         count += horizon
