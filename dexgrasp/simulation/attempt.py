@@ -118,26 +118,33 @@ class Attempt:
         drivers, rates = world.driver_qpos[closing], world.driver_qvel[closing]
         begin = self._unhindered(wanted, closing, direction) if self.calm else 0
         goal = start.copy() if begin == 0 else wanted[begin - 1].copy()
-        data, ctrl = self.data, self.data.ctrl
-        joints = direction * data.qpos[drivers]
+        data, ctrl, qpos = self.data, self.data.ctrl, self.data.qpos
+        # Few joints, many steps: plain numbers are several times faster than arrays, and as exact.
+        servos = list(zip(closing.tolist(), drivers.tolist(), direction.tolist(), end.tolist(), strict=True))
+        way, last, goals = wanted.tolist(), grasp.tolist(), goal.tolist()
+        joints = [sign * qpos.item(at) for _, at, sign, _ in servos]
         for step in range(begin, steps + self._steps(motion.closing_time)):
-            aim = wanted[step] if step < steps else grasp + min((step + 1 - steps) * speed, beyond)
-            np.minimum(np.maximum(goal, np.minimum(aim, joints + lead), out=goal), end, out=goal)
-            ctrl[closing] = direction * goal
+            beside = min((step + 1 - steps) * speed, beyond)
+            aims = way[step] if step < steps else [angle + beside for angle in last]
+            for i, (servo, _, sign, stop) in enumerate(servos):
+                goals[i] = min(max(goals[i], min(aims[i], joints[i] + lead)), stop)
+                ctrl[servo] = sign * goals[i]
             mujoco.mj_step(self.model, data)
-            joints = direction * data.qpos[drivers]
+            joints = [sign * qpos.item(at) for _, at, sign, _ in servos]
             if step % self.check == 0:
                 self._look()
+                goal = np.array(goals)
                 stalled = np.abs(data.qvel[rates]) < motion.stalled_speed
-                stalled &= (goal - joints > motion.stalled_effort * lead) | (goal >= end)
+                stalled &= (goal - np.array(joints) > motion.stalled_effort * lead) | (goal >= end)
                 if step >= steps and ((step + 1 - steps) * speed > beyond or stalled.all()):
                     break
         if motion.overdrive is not None:
             return
-        steps = self._steps(motion.squeeze_time)
+        goal, steps = np.array(goals), self._steps(motion.squeeze_time)
         squeeze = (motion.grip_effort - motion.closing_effort) * error
-        for step in range(steps):
-            ctrl[closing] = direction * np.minimum(goal + (step + 1) / steps * squeeze, end)
+        path = direction * np.minimum(goal + np.arange(1, steps + 1)[:, None] / steps * squeeze, end)
+        for step, angles in enumerate(path):
+            ctrl[closing] = angles
             mujoco.mj_step(self.model, data)
             if step % self.check == 0:
                 self._look()
@@ -214,7 +221,7 @@ class Attempt:
         some = bool(touched.any())
         if some and self.first < 0:
             self.first = int(np.argmax(touched))
-        risen = self._rise() > self.protocol.verdict.left
+        risen = (self._rise() > self.protocol.verdict.left) & ~self.left
         if risen.any():
             self.left |= risen & ~self.world.on_table()
         return some

@@ -185,9 +185,9 @@ class World:
 
     def _touching(self, owner: int) -> NDArray[np.bool_]:
         result = np.zeros(len(self._bodies), dtype=bool)
-        pairs = self._pairs()
-        others = pairs[(pairs == owner).any(axis=1)].max(axis=1)
-        result[others[others >= 0]] = True
+        first, second = self._pairs().T
+        result[first[(second == owner) & (first >= 0)]] = True
+        result[second[(first == owner) & (second >= 0)]] = True
         return result
 
     def _pairs(self) -> NDArray[np.int64]:
