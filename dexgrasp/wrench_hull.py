@@ -122,7 +122,7 @@ def _grow(
     while True:
         # The nearest of the facets that are still there, less those already as far as the hull reaches somewhere. A
         # pass over the few that are left costs less than a heap, most of whose facets are gone before their turn.
-        lower, facet = np.inf, np.uint32(0)
+        lower, facet = np.inf, items[0]
         if wanted == VOLUME:
             while left > 0 and lower == np.inf:
                 left -= 1
