@@ -1,11 +1,13 @@
 """Conservative advancement: a finger moves on the way that it closes, as far as it surely touches nothing."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
 from dexgrasp.distance import Field, interpolated, quick_bound, seed_at
 from dexgrasp.hand_body import HandBody, carry, place_link
-from dexgrasp.patch_distance import patch_time
+from dexgrasp.patch_distance import SCRATCH, move_patch, patch_time
 from dexgrasp.triangle_tree import nearest
 
 TOUCH = 4e-5
@@ -16,10 +18,38 @@ NEAR = 0.5
 """A bounding ball is split once the surface is nearer than this many times what splitting may gain."""
 CLOSE = 5e-4
 """Below this the grid's lower bound gives way to distances to triangles, m."""
+FAR = 3e-3
+"""Of distances from a ball to the surface above this the grid's quickest bound will do, m."""
 REACH = 5e-3
 """Triangles farther than this from a link are not looked at, m."""
 AHEAD = 1.0
 """What is due within this part of the last step is looked at early."""
+
+
+class Scratch(NamedTuple):
+    """What `advance` works in."""
+
+    due: np.ndarray
+    nodes: np.ndarray
+    chain: np.ndarray
+    twists: np.ndarray
+    """(L, 6) angular velocity, and the velocity of what is at the object's origin."""
+    moved: np.ndarray
+    work: np.ndarray
+
+
+@njit(cache=True)
+def advance_scratch(body: HandBody) -> Scratch:
+    """Return arrays for `advance` to work in."""
+    nodes, links, spans = len(body.cover.balls), len(body.parents), body.cover.spans
+    return Scratch(
+        np.empty(nodes),
+        np.empty(nodes, np.int64),
+        np.empty(links, np.int64),
+        np.zeros((links, 6)),
+        np.empty((3, (spans[1:] - spans[:-1]).max())),
+        np.empty(SCRATCH),
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -31,25 +61,26 @@ def advance(
     rate: np.ndarray,
     full: np.ndarray,
     poses: np.ndarray,
-    due: np.ndarray,
-    nodes: np.ndarray,
-    chain: np.ndarray,
     free: np.ndarray,
     ways: np.ndarray,
-    twists: np.ndarray,
-    work: np.ndarray,
+    scratch: Scratch,
     hit: np.ndarray,
 ) -> int:
     """Move joints at `rate` from `full` until a link touches; return it, or -1 at the limits.
 
     `full` and `poses` end at that posture; `hit` is the touch: distance, point and normal; links that moved without
     an overlap are `free`. Every waiting node of the covering trees holds the time before which nothing below it can
-    touch: its distance over its largest speed. `due` to `work` are scratch, but `ways`: the directions along which each
-    part was apart from the object last.
+    touch: its distance over its largest speed. `ways` (P, 3) are the directions along which each part was apart from
+    the object last, or 0.
     """
-    cover, motions, limits, shapes, tree = body.cover, body.motions, body.limits, body.shapes, field.tree
-    balls, children, gains, owners = cover.balls, cover.children, cover.gains, cover.links
+    due, nodes, chain, twists, moved, work = scratch
+    cover, motions, limits, tree = body.cover, body.motions, body.limits, field.tree
+    balls, children, gains, owners, roots = cover.balls, cover.children, cover.gains, cover.links, cover.roots
+    points, spans, patch_balls, parts = cover.points, cover.spans, cover.patch_balls, cover.parts
     speeds, patch_speeds, bends = cover.speeds[finger], cover.patch_speeds[finger], cover.bends[finger]
+    boxes, skips, firsts, corners, normals = tree
+    values, spacing = field.values, field.spacing
+    left, below, behind = field.origin
     start, end = full.copy(), 0.0
     for m in range(len(rate)):
         if rate[m] != 0:
@@ -62,16 +93,15 @@ def advance(
         if moving[link]:
             chain[links] = link
             links += 1
-            if cover.roots[link] >= 0:
-                due[size], nodes[size] = 0.0, cover.roots[link]
+            if roots[link] >= 0:
+                due[size], nodes[size] = 0.0, roots[link]
                 size += 1
-    placed, time, pause = -1.0, 0.0, 0.0
+    placed, turned, time, pause = -1.0, -1.0, 0.0, 0.0
     while size:
         # What is due soon is looked at now: placing links costs more.
         horizon = time + (AHEAD * (time - placed) if placed >= 0 else 0.0)
         if time > placed:
             _place(motions, limits, base, chain[:links], start, rate, time, full, poses)
-            pause = _turn(motions, limits, chain[:links], start, rate, time, poses, twists)
             placed = time
         k, soonest = 0, np.inf
         while k < size:
@@ -82,28 +112,37 @@ def advance(
             node = nodes[k]
             link = owners[node]
             x, y, z = carry(poses, link, balls, node)
-            gap = quick_bound(field, x, y, z) - balls[node, 3]
+            radius = balls[node, 3]
+            gap = quick_bound(values, boxes, left, below, behind, spacing, x, y, z, radius + FAR) - radius
             if children[node, 0] >= 0 and gap <= NEAR * gains[node]:
-                nodes[k], nodes[size], due[size] = children[node, 0], children[node, 1], time
+                nodes[k], nodes[size], due[size] = children[node, 0], children[node, 1], due[k]
                 size += 1
                 continue
             wait = (gap - SPARE) / speeds[node]
             if gap < CLOSE and children[node, 0] < 0:
-                if time == 0 and interpolated(field, x, y, z) < field.spacing:
+                if due[k] > time:  # a patch is not looked at before it must
+                    soonest = min(soonest, due[k])
+                    k += 1
+                    continue
+                if time == 0 and interpolated(field, x, y, z) < spacing:
                     nearest(tree, x, y, z, seed_at(field, x, y, z), hit)
                     if hit[0] < 0:  # the link starts inside the object
                         return link
-                part = cover.parts[node]
-                work[7, 0, 0], work[7, 0, 1], work[7, 0, 2] = x, y, z
-                way = ways[part]
+                if turned < time:
+                    pause = _turn(motions, limits, chain[:links], start, rate, time, poses, twists)
+                    turned = time
+                x, y, z = carry(poses, link, patch_balls, node)
+                way = ways[parts[node]]
                 seed = seed_at(field, x, y, z)
                 if way[0] == 0 and way[1] == 0 and way[2] == 0:
                     for i in range(3):
-                        way[i] = -tree.normals[seed, 0, i]
-                most, fastest = min(pause, end) - time, patch_speeds[node]
+                        way[i] = -normals[seed, 0, i]
+                first, last = spans[node], spans[node + 1]
+                speed = move_patch(points, first, last, poses[link], twists[link], moved)
                 clear = patch_time(
-                    shapes, tree, poses[link], twists[link], part, way, seed, balls[node, 3], fastest, bends[node],
-                    min(most, REACH / fastest), TOUCH, SPARE, work, hit,
+                    moved, last - first, boxes, skips, firsts, corners, normals, twists[link], way, seed,
+                    x, y, z, patch_balls[node, 3], speed, bends[node],
+                    min(min(pause, end) - time, REACH / patch_speeds[node]), TOUCH, SPARE, work, hit,
                 )  # fmt: skip
                 if clear < 0:
                     for c in range(links):

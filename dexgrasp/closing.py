@@ -8,14 +8,14 @@ from jaxtyping import Bool, Float
 from numba import njit
 from torch import Tensor
 
-from dexgrasp.advance import advance
+from dexgrasp.advance import Scratch, advance, advance_scratch
 from dexgrasp.batch import Batch
+from dexgrasp.borrow import borrowed
 from dexgrasp.collision import as_arrays, deepest
 from dexgrasp.distal_contact import BLUR, MOST, distal_contact, is_tip
 from dexgrasp.distance import DistanceField, Field, interpolated, quick_bound, seed_at
 from dexgrasp.hand import Hand
 from dexgrasp.hand_body import HandBody, carry, hand_body, place_links
-from dexgrasp.patch_distance import SCRATCH
 from dexgrasp.triangle_tree import nearest
 
 CLOSED, PENETRATES, MISSES, OFF_TIP = range(4)
@@ -98,12 +98,38 @@ def close_fingers(
     touches = np.full((count, fingers, 6), np.nan)
     on_tip = np.zeros((count, fingers), np.bool_)
     depth = np.zeros(count)
-    poses = np.empty((len(body.parents), 3, 4))
-    rate, done = np.empty(len(body.offset)), np.zeros(fingers, np.bool_)
-    ways, free = np.zeros((len(body.part_links), 3)), np.zeros(len(body.parents), np.bool_)
-    due, nodes = np.empty(len(body.cover.balls)), np.empty(len(body.cover.balls), np.int64)
-    twists, chain = np.zeros((len(body.parents), 6)), np.empty(len(body.parents), np.int64)
-    work, found, hit, contact = np.empty(SCRATCH), np.empty((MOST, 8)), np.empty(7), np.empty(7)
+    links, parts, joint_count = len(body.parents), len(body.part_links), len(body.offset)
+    # The compiled code that is called gets all its arrays as arguments: only these may be borrowed there.
+    _close(
+        body, field, bases, joints, breakaway, strict, limit,
+        (status, full, touches, on_tip, depth),
+        (np.empty((links, 3, 4)), np.empty(joint_count), np.zeros(fingers, np.bool_), np.zeros(links, np.bool_)),
+        (np.zeros((parts, 3)), np.empty((MOST, 8)), np.empty(7), np.empty(7)),
+        advance_scratch(body),
+    )  # fmt: skip
+    return status, full, touches, on_tip, depth
+
+
+@njit(cache=True)
+def _close(
+    body: HandBody,
+    field: Field,
+    bases: np.ndarray,
+    joints: np.ndarray,
+    breakaway: bool,
+    strict: bool,
+    limit: float,
+    results: tuple[np.ndarray, ...],
+    of_links: tuple[np.ndarray, ...],
+    of_contacts: tuple[np.ndarray, ...],
+    scratch: Scratch,
+) -> None:
+    body, field, bases, joints = borrowed(body), borrowed(field), borrowed(bases), borrowed(joints)
+    status, full, touches, on_tip, depth = borrowed(results)
+    poses, rate, done, free = borrowed(of_links)
+    ways, found, hit, contact = borrowed(of_contacts)
+    scratch = borrowed(scratch)
+    count, fingers = len(bases), len(body.tip_links)
     for i in range(count):
         place_links(body, joints[i], bases[i], full[i], poses)
         if strict and deepest(body, field, poses, -limit, True) < -limit:
@@ -120,10 +146,7 @@ def close_fingers(
                 for j in range(joints.shape[1]):
                     rate[m] += body.coupling[m, j] * body.rates[finger, j]
             while True:
-                touched = advance(
-                    body, field, bases[i], finger, rate, full[i], poses,
-                    due, nodes, chain, free, ways, twists, work, hit,
-                )  # fmt: skip
+                touched = advance(body, field, bases[i], finger, rate, full[i], poses, free, ways, scratch, hit)
                 if not breakaway or touched < 0 or touched == body.tip_links[finger]:
                     break
                 # The link that touches and all above it stop; what lies beyond goes on.
@@ -141,7 +164,7 @@ def close_fingers(
                 done[other] = True
                 tip = body.tip_links[other]
                 if touched == tip or not _above(body.parents, touched, tip):
-                    if not distal_contact(body, field, poses, other, touched == tip, nodes, found, contact):
+                    if not distal_contact(body, field, poses, other, touched == tip, scratch.nodes, found, contact):
                         continue
                     on_tip[i, other] = is_tip(body, poses, other, contact)
                     touches[i, other] = contact[1:7]
@@ -151,8 +174,7 @@ def close_fingers(
                 status[i] = MISSES if np.isnan(touches[i, finger, 0]) else OFF_TIP
                 break
         if not strict:
-            depth[i] = _depth(body, field, poses, free, nodes, hit)
-    return status, full, touches, on_tip, depth
+            depth[i] = _depth(body, field, poses, free, scratch.nodes, hit)
 
 
 @njit(cache=True)
@@ -173,6 +195,8 @@ def _depth(
 ) -> float:
     """Return how deep the links that are not known to be free of the object are in it, 0 for none (m)."""
     balls, children, tree = body.balls, body.children, field.tree
+    values, boxes, h = field.values, tree.boxes, field.spacing
+    a, b, c = field.origin
     best = 0.0
     for link in range(len(free)):
         if free[link] or body.roots[link] < 0:
@@ -182,7 +206,7 @@ def _depth(
             top -= 1
             node = stack[top]
             x, y, z = carry(poses, link, balls, node)
-            if quick_bound(field, x, y, z) - balls[node, 3] >= -best:
+            if quick_bound(values, boxes, a, b, c, h, x, y, z, balls[node, 3] - best) >= balls[node, 3] - best:
                 continue
             if children[node, 0] >= 0:
                 stack[top], stack[top + 1] = children[node, 0], children[node, 1]

@@ -111,6 +111,10 @@ def as_arrays(pose: Tensor, joints: Tensor) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
+FAR = 3e-3
+"""Of distances from a ball to the surface above this the grid's quickest bound will do, m."""
+
+
 @njit(cache=True)
 def deepest(body: HandBody, field: Field, poses: np.ndarray, ceiling: float, first: bool) -> float:
     """Return the least signed distance of the hand to the object where it is below `ceiling`, else `ceiling`.
@@ -187,6 +191,8 @@ def way_clear(
 
     The way is straight, `retreat` (m) along the unit vector `direction`. Only links that are `near` (L,) are tested.
     """
+    values, boxes, h = field.values, field.tree.boxes, field.spacing
+    a, b, c = field.origin
     stack, since = np.empty(256, np.int64), np.empty(256)
     out = np.empty(7)
     for link in range(len(body.roots)):
@@ -202,9 +208,7 @@ def way_clear(
             # A ball's distance cannot shrink faster than it travels.
             while way <= retreat:
                 u, v, w = x + way * direction[0], y + way * direction[1], z + way * direction[2]
-                gap = quick_bound(field, u, v, w) - radius
-                if gap < 0.003:
-                    gap = lower_bound(field, u, v, w) - radius
+                gap = quick_bound(values, boxes, a, b, c, h, u, v, w, radius + FAR) - radius
                 if gap < 5e-4:
                     if body.children[node, 0] >= 0:
                         stack[top], stack[top + 1] = body.children[node, 0], body.children[node, 1]

@@ -1,10 +1,6 @@
-"""Exact distance between a convex polytope and a triangle: Gilbert, Johnson & Keerthi (1988)."""
-
-from collections.abc import Sequence
-from typing import NamedTuple
+"""Exact distance between the hull of a few points and a triangle: Gilbert, Johnson & Keerthi (1988)."""
 
 import numpy as np
-import trimesh
 from numba import njit
 
 from dexgrasp.triangle_tree import to_triangle
@@ -17,90 +13,60 @@ TOUCHING = 1e-8
 """Distances below this are taken as none, m."""
 
 
-class Polytopes(NamedTuple):
-    """P convex bodies of V corners in all, m."""
-
-    corners: np.ndarray
-    """(V, 3)."""
-    firsts: np.ndarray
-    """(P + 1,) the first corner of each."""
-    starts: np.ndarray
-    """(V + 1,) the first of each corner's neighbours"""
-    neighbours: np.ndarray
-    """(E,) in this list: corners that share an edge."""
-
-
-def polytopes(bodies: Sequence[trimesh.Trimesh]) -> Polytopes:
-    """Return convex meshes (m) as arrays."""
-    corners, firsts, ends = [], [0], []
-    for body in bodies:
-        hull = body.convex_hull
-        ends.append(np.concatenate([hull.edges_unique, hull.edges_unique[:, ::-1]]) + firsts[-1])
-        corners.append(np.asarray(hull.vertices))
-        firsts.append(firsts[-1] + len(hull.vertices))
-    pairs = np.concatenate(ends)
-    pairs = pairs[np.lexsort(pairs.T[::-1])]
-    starts = np.searchsorted(pairs[:, 0], np.arange(firsts[-1] + 1))
-    return Polytopes(np.concatenate(corners), np.array(firsts), starts, np.ascontiguousarray(pairs[:, 1]))
+@njit(cache=True, error_model="numpy", fastmath={"nnan", "nsz"})
+def farthest(
+    points: np.ndarray, count: int, a: float, b: float, c: float, u: float, v: float, w: float
+) -> tuple[float, float]:
+    """Return how far the first `count` of points (3, K) reach along each of two directions."""
+    one, two = -np.inf, -np.inf
+    for k in range(count):
+        x, y, z = points[0, k], points[1, k], points[2, k]
+        first, second = a * x + b * y + c * z, u * x + v * y + w * z
+        one = first if first > one else one
+        two = second if second > two else two
+    return one, two
 
 
 @njit(cache=True, error_model="numpy")
-def support(bodies: Polytopes, corner: int, x: float, y: float, z: float) -> int:
-    """Return the corner of a body that lies farthest in a direction, by climbing from one of its corners."""
-    corners, starts, neighbours = bodies.corners, bodies.starts, bodies.neighbours
-    best = corners[corner, 0] * x + corners[corner, 1] * y + corners[corner, 2] * z
-    climbing = True
-    while climbing:
-        climbing = False
-        here = corner
-        for e in range(starts[here], starts[here + 1]):
-            other = neighbours[e]
-            value = corners[other, 0] * x + corners[other, 1] * y + corners[other, 2] * z
-            if value > best:
-                best, corner, climbing = value, other, True
-    return corner
-
-
-@njit(cache=True, error_model="numpy")
-def to_polytope(
-    bodies: Polytopes,
-    corner: int,
-    triangle: np.ndarray,
+def to_hull(
+    points: np.ndarray,
+    count: int,
+    corners: np.ndarray,
+    triangle: int,
     direction: np.ndarray,
     close: float,
-    limit: float,
     work: np.ndarray,
-) -> tuple[float, int]:
-    """Return the distance of a triangle (3, 3) to the body that has `corner`, and a corner near to it; m.
+) -> float:
+    """Return the distance of a triangle of corners (T, 3, 3) to the hull of the first `count` of points (3, K), m.
 
-    `direction` (3,), from the body to the triangle, is the first guess, and afterwards the unit direction of the
-    shortest way. Of a distance above `close` some lower bound above it, and at least half as large, is told, and above
-    `limit` any bound above it. `work` (5, 4, 3) is scratch;
-    afterwards work[4, 0] holds the weights of the triangle's corners in its nearest point.
+    `direction` (3,), from the hull to the triangle, is the first guess, and afterwards the unit direction of the
+    shortest way. Of a distance above `close` some lower bound above it, and at least half as large, is told.
+    `work` (5, 4, 3) is scratch; afterwards work[4, 0] holds the weights of the triangle's corners in its nearest point.
     """
-    corners, simplex, told = bodies.corners, work[3], work[4]
+    simplex, told = work[3], work[4]
     x, y, z = direction[0], direction[1], direction[2]
     size, found, bound = 0, np.inf, 0.0
     for _ in range(STEPS):
-        corner = support(bodies, corner, x, y, z)
+        corner, reach = 0, -np.inf
+        for k in range(count):
+            value = points[0, k] * x + points[1, k] * y + points[2, k] * z
+            if value > reach:
+                corner, reach = k, value
         t, value = 0, np.inf
         for k in range(3):
-            other = triangle[k, 0] * x + triangle[k, 1] * y + triangle[k, 2] * z
+            other = corners[triangle, k, 0] * x + corners[triangle, k, 1] * y + corners[triangle, k, 2] * z
             if other < value:
                 t, value = k, other
         length = np.sqrt(x * x + y * y + z * z)
-        bound = (value - corners[corner, 0] * x - corners[corner, 1] * y - corners[corner, 2] * z) / length
-        if bound > limit:
-            direction[0], direction[1], direction[2] = x / length, y / length, z / length
-            return bound, corner
+        bound = (value - reach) / length
         if size and (length - bound <= PRECISION * length or (bound >= close and 2 * bound >= length)):
             break
         for i in range(3):
-            simplex[size, i] = triangle[t, i] - corners[corner, i]
+            simplex[size, i] = corners[triangle, t, i] - points[i, corner]
         told[size, 1] = t
         size = _reduce(work, size + 1)
         if size == 4:
-            return 0.0, corner
+            return 0.0
         a, b, c = 0.0, 0.0, 0.0
         for k in range(size):
             a += told[k, 2] * simplex[k, 0]
@@ -114,9 +80,9 @@ def to_polytope(
         for k in range(size):
             told[int(told[k, 1]), 0] += told[k, 2]
         if found <= TOUCHING:
-            return 0.0, corner
+            return 0.0
     direction[0], direction[1], direction[2] = x / found, y / found, z / found
-    return max(bound, 0.0), corner
+    return max(bound, 0.0)
 
 
 @njit(cache=True, error_model="numpy")

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 
 from dexgrasp.ball_tree import inscribed, planes
 from dexgrasp.kinematics import LinkRecord
@@ -21,6 +21,8 @@ TOLERANCE = 1e-3
 """How far balls may stand out, m; but more at sharp edges."""
 STILL = 1e-9
 """Speed of what does not move, such as centres on a joint's axis, m."""
+FLAT = 1e-9
+"""Patches thinner than this are plane, m."""
 GAIN = 1e-3
 """Splitting a ball is taken to gain at least this, m."""
 
@@ -34,6 +36,12 @@ class Cover(NamedTuple):
     """(M, 2); -1 for a leaf, which holds one patch."""
     gains: np.ndarray
     """(M,) how much closer, about, the surface is followed after splitting; 0 for a leaf."""
+    points: np.ndarray
+    """(K, 3) corners of the hulls of all patches."""
+    spans: np.ndarray
+    """(M + 1,) the first point of each node; only leaves have any."""
+    patch_balls: np.ndarray
+    """(M, 4) ball that holds the patch of a leaf, and little else."""
     parts: np.ndarray
     """(M,) the convex part, of all the hand's, that a leaf's patch lies on; -1 for other nodes."""
     links: np.ndarray
@@ -48,6 +56,9 @@ class Cover(NamedTuple):
     """(F, M) bound of the acceleration of these points at a constant closing speed."""
 
 
+PER_FINGER = ("speeds", "patch_speeds", "bends")
+
+
 def hand_cover(
     links: Sequence[LinkRecord],
     parts: Mapping[str, Sequence[trimesh.Trimesh]],
@@ -58,7 +69,7 @@ def hand_cover(
     known: dict[bytes, tuple[Cover, list[np.ndarray]]] = {}  # the fingers of a hand are often alike
     trees: list[Cover] = []
     roots, moving = np.full(len(links), -1), np.zeros(len(links), dtype=bool)
-    count = first = 0
+    count = first = total = 0
     for number, link in enumerate(links):
         moving[number] = link.parent >= 0 and moving[link.parent]
         moving[number] |= link.index >= 0 and bool(rates[:, link.index].any())
@@ -80,6 +91,7 @@ def hand_cover(
             trees.append(
                 tree._replace(
                     children=np.where(tree.children < 0, -1, tree.children + count),
+                    spans=tree.spans[:-1] + total,
                     parts=np.where(tree.parts < 0, -1, tree.parts + first),
                     links=np.full(len(tree.balls), number),
                     speeds=of_centers[:, 0],
@@ -89,13 +101,14 @@ def hand_cover(
             )
             roots[number] = count
             count += len(tree.balls)
+            total += len(tree.points)
         first += len(bodies)
-    return Cover(
-        *(
-            roots if name == "roots" else np.concatenate([getattr(tree, name) for tree in trees], axis=axis)
-            for name, axis in zip(Cover._fields, (0, 0, 0, 0, 0, 0, 1, 1, 1), strict=True)
-        )
-    )
+    joined = {
+        name: np.concatenate([getattr(tree, name) for tree in trees], axis=int(name in PER_FINGER))
+        for name in Cover._fields
+        if name != "roots"
+    }
+    return Cover(**joined | {"roots": roots, "spans": np.append(joined["spans"], total)})
 
 
 def _speeds(
@@ -200,8 +213,9 @@ def _tree(
 ) -> tuple[Cover, list[np.ndarray]]:
     count = 2 * len(leaves) - 1
     none = np.zeros(0)  # what only the hand knows
-    made = Cover(np.zeros((count, 4)), np.full((count, 2), -1), np.zeros(count), np.full(count, -1),
-                 none, none, none, none, none)  # fmt: skip
+    made = Cover(np.zeros((count, 4)), np.full((count, 2), -1), np.zeros(count), none, np.zeros(count + 1, dtype=int),
+                 np.zeros((count, 4)), np.full(count, -1), none, none, none, none, none)  # fmt: skip
+    corners = list[np.ndarray]()
     middles = np.array([points.mean(axis=0) for points in patches])
     stands, surface = np.zeros(count), list[np.ndarray]()
     stack = [(np.arange(len(leaves)), -1, 0)]
@@ -215,6 +229,10 @@ def _tree(
         centers = leaves[members[:: -(-len(members) // 16)], :3]
         if len(members) == 1:
             made.parts[node] = owners[members[0]]
+            corners.append(_extreme(points))
+            middle = (points.min(axis=0) + points.max(axis=0)) / 2
+            made.patch_balls[node] = *middle, np.linalg.norm(points - middle, axis=1).max()
+            made.spans[node + 1] = len(corners[-1])
         else:
             centers = np.concatenate(
                 [
@@ -244,4 +262,14 @@ def _tree(
         stands[node] = radii[best] - max(depths[best], 0)
     inside = made.children[:, 0] >= 0
     made.gains[inside] = np.maximum(stands[inside] - stands[made.children[inside]].max(axis=1), GAIN)
-    return made, surface
+    return made._replace(points=np.concatenate(corners), spans=np.cumsum(made.spans)), surface
+
+
+def _extreme(points: np.ndarray) -> np.ndarray:
+    """Return those points (K, 3) that span the hull of all, be it flat."""
+    away = points - points.mean(axis=0)
+    along = away @ np.linalg.svd(away, full_matrices=False)[2].T
+    rank = int((np.ptp(along, axis=0) > FLAT).sum())
+    if rank < 2 or len(points) <= rank + 1:
+        return points
+    return points[ConvexHull(along[:, :rank]).vertices]

@@ -144,16 +144,42 @@ def lower_bound(field: Field, x: float, y: float, z: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def quick_bound(field: Field, x: float, y: float, z: float) -> float:
-    """Return a lower bound of the signed distance at a point (m), from the nearest grid node alone."""
-    h = field.spacing
-    u, v, w = (x - field.origin[0]) / h, (y - field.origin[1]) / h, (z - field.origin[2]) / h
-    nx, ny, nz = field.values.shape
+def quick_bound(
+    values: np.ndarray,
+    boxes: np.ndarray,
+    a: float,
+    b: float,
+    c: float,
+    h: float,
+    x: float,
+    y: float,
+    z: float,
+    far: float,
+) -> float:
+    """Return a lower bound of the signed distance at a point (m): from the nearest grid node alone if that is `far`.
+
+    Else from the eight nodes about it. Let p be the point, c the surface's nearest one, and draw a node n with the
+    weights of linear interpolation, whose mean is p: the interpolated value is at most E|n - c|, so that by Jensen its
+    square is at most |p - c|^2 + Var n. The grid's origin is (a, b, c), its spacing h.
+    """
+    u, v, w = (x - a) / h, (y - b) / h, (z - c) / h
+    nx, ny, nz = values.shape
     if u < 0 or v < 0 or w < 0 or u > nx - 1 or v > ny - 1 or w > nz - 1:
-        return math.sqrt(to_box(field.tree.boxes, 0, x, y, z))
+        return math.sqrt(to_box(boxes, 0, x, y, z))
     i, j, k = int(u + 0.5), int(v + 0.5), int(w + 0.5)
+    p, q, r = u - i, v - j, w - k
+    bound = values[i, j, k] - h * math.sqrt(p * p + q * q + r * r)
+    if bound >= far:
+        return bound
+    i, j, k = min(int(u), nx - 2), min(int(v), ny - 2), min(int(w), nz - 2)
     u, v, w = u - i, v - j, w - k
-    return field.values[i, j, k] - h * math.sqrt(u * u + v * v + w * w)
+    low = (1 - v) * ((1 - w) * values[i, j, k] + w * values[i, j, k + 1])
+    low += v * ((1 - w) * values[i, j + 1, k] + w * values[i, j + 1, k + 1])
+    high = (1 - v) * ((1 - w) * values[i + 1, j, k] + w * values[i + 1, j, k + 1])
+    high += v * ((1 - w) * values[i + 1, j + 1, k] + w * values[i + 1, j + 1, k + 1])
+    mean = (1 - u) * low + u * high
+    square = mean * mean - h * h * (u * (1 - u) + v * (1 - v) + w * (1 - w))
+    return max(bound, math.sqrt(square)) if mean > 0 and square > 0 else bound
 
 
 @njit(cache=True, error_model="numpy")

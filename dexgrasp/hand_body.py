@@ -6,7 +6,6 @@ import numpy as np
 from numba import njit
 
 from dexgrasp.ball_tree import ball_tree, inscribed_balls, planes
-from dexgrasp.convex_distance import Polytopes, polytopes
 from dexgrasp.cover import Cover, hand_cover
 from dexgrasp.errors import DexgraspError
 from dexgrasp.hand import Hand
@@ -67,8 +66,6 @@ class HandBody(NamedTuple):
     """(F, J) joint velocities that close each finger, per unit of its closing parameter."""
     cover: Cover
     """Balls that hold the whole surface of the links that fingers move: what closing looks at."""
-    shapes: Polytopes
-    """The P convex parts again."""
     tip_links: np.ndarray
     """(F,) distal links."""
     tips: np.ndarray
@@ -136,7 +133,6 @@ def _compile(hand: UrdfHand, coarseness: float) -> HandBody:
         vertex_links=np.concatenate([np.full(len(part.vertices), link) for link, part in bodies]),
         rates=rates,
         cover=_cover(hand, limits, rates @ matrix.T),
-        shapes=polytopes([part for _, part in bodies]),
         tip_links=np.array([names.index(finger.link) for finger in hand.fingers]),
         tips=np.array([[*f.tip_center.tolist(), *f.closing_axis.tolist(), f.tip_radius] for f in hand.fingers]),
     )
