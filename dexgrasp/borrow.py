@@ -15,8 +15,8 @@ def _borrowed(context: Any, loan: Any) -> Any:
     """
 
     def lend(target: Any, builder: Any, kind: Any, value: Any) -> Any:
-        if isinstance(kind, types.BaseTuple):
-            members: tuple[Any, ...] = kind.types
+        members = getattr(kind, "types", None)  # of a tuple
+        if members is not None:
             parts = [lend(target, builder, part, builder.extract_value(value, k)) for k, part in enumerate(members)]
             return target.make_tuple(builder, kind, parts)
         if not isinstance(kind, types.Array):
