@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numba import njit
 
+from dexgrasp.borrow import borrowed
 from dexgrasp.distance import DistanceField, Field, trilinear
 from dexgrasp.hand import Hand
 from dexgrasp.hand_body import HandBody, carry, hand_body, place_links
@@ -210,17 +211,48 @@ def _look(
     speeds: np.ndarray,
     limit: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    motions, balls, children, roots, centers = body.motions, body.balls, body.children, body.roots, body.tips
     grid, frame = field.values, np.empty((2, 6))
     frame[0], frame[1, :3], frame[1, 3] = field.tree.boxes[0], field.origin, field.spacing
     count, fingers, movable = len(bases), len(body.tip_links), len(body.offset)
     status = np.zeros(count, np.int64)
     closed, touches = np.empty((count, movable)), np.full((count, fingers, 6), np.nan)
-    start, full = np.empty(movable), np.empty(movable)
-    rates = body.rates @ body.coupling.T
-    poses = np.empty((len(body.parents), 3, 4))
-    stack, tips = np.empty(256, np.int64), np.empty((fingers, 3))
-    for i in range(count):
+    _look_at(
+        body, grid, frame, bases, joints, chains, speeds, limit,
+        (status, closed, touches), body.rates @ body.coupling.T,
+        (np.empty(movable), np.empty(movable), np.empty((len(body.parents), 3, 4)), np.empty((fingers, 3))),
+        np.empty(256, np.int64),
+    )  # fmt: skip
+    return status, closed, touches
+
+
+@njit(cache=True)
+def _look_at(
+    body: HandBody,
+    grid: np.ndarray,
+    frame: np.ndarray,
+    bases: np.ndarray,
+    joints: np.ndarray,
+    chains: np.ndarray,
+    speeds: np.ndarray,
+    limit: float,
+    results: tuple[np.ndarray, ...],
+    rates: np.ndarray,
+    scratch: tuple[np.ndarray, ...],
+    stack: np.ndarray,
+) -> None:
+    body, grid, frame, bases, joints = (
+        borrowed(body),
+        borrowed(grid),
+        borrowed(frame),
+        borrowed(bases),
+        borrowed(joints),
+    )
+    chains, rates, stack = borrowed(chains), borrowed(rates), borrowed(stack)
+    status, closed, touches = borrowed(results)
+    start, full, poses, tips = borrowed(scratch)
+    motions, balls, children, roots, centers = body.motions, body.balls, body.children, body.roots, body.tips
+    fingers, movable = len(centers), len(start)
+    for i in range(len(bases)):
         place_links(body, joints[i], bases[i], start, poses)
         closed[i] = start
         if _buried(balls, children, roots, grid, frame, poses, limit, stack):
@@ -253,4 +285,3 @@ def _look(
         if status[i] == SEEN:
             for finger in range(fingers):
                 _foot(grid, frame, tips[finger], touches[i, finger])
-    return status, closed, touches
