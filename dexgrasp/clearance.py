@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from numba import njit
 from torch import Tensor
 
+from dexgrasp.borrow import borrowed
 from dexgrasp.collision import HandShape, as_arrays, way_clear
 from dexgrasp.distance import DistanceField, Field
 from dexgrasp.geometry import inverse
@@ -108,6 +109,7 @@ def _above(
     retreat: float,
     least: float,
 ) -> np.ndarray:
+    body, bases, joints = borrowed(body), borrowed(bases), borrowed(joints)
     above = np.ones(len(bases), np.bool_)
     rows = np.empty((len(body.parents), 4))
     for i in range(len(bases)):
@@ -163,6 +165,7 @@ def _place(
     body: HandBody, bases: np.ndarray, joints: np.ndarray, backward: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return world_T_link (N, L, 3, 4) and the directions in which hands back away (N, 3)."""
+    body, bases, joints = borrowed(body), borrowed(bases), borrowed(joints)
     links, ways = np.empty((len(bases), len(body.parents), 3, 4)), np.empty((len(bases), 3))
     full = np.empty(len(body.offset))
     for i in range(len(bases)):
@@ -186,6 +189,8 @@ def _avoid_object(
     clear: np.ndarray,
 ) -> None:
     """Take away the flags of hands that come nearer to an object than `margin`; `frame` is object_T_world (3, 4)."""
+    body, cores, field, links = borrowed(body), borrowed(cores), borrowed(field), borrowed(links)
+    frame, ways = borrowed(frame), borrowed(ways)
     poses, direction, near = np.empty(links.shape[1:]), np.empty(3), np.empty(len(body.roots), np.bool_)
     box = field.tree.boxes[0]
     middle, around = (box[:3] + box[3:]) / 2, np.sqrt(((box[3:] - box[:3]) ** 2).sum()) / 2
@@ -235,6 +240,7 @@ def _avoid_boxes(
     clear: np.ndarray,
 ) -> None:
     """Take away the flags of hands that come nearer to a box than `margin`; `frames` are box_T_world (K, 3, 4)."""
+    body, links, ways, halves = borrowed(body), borrowed(links), borrowed(ways), borrowed(halves)
     poses, direction = np.empty(links.shape[1:]), np.empty(3)
     stack, since = np.empty(256, np.int64), np.empty(256)
     for number in range(len(frames)):

@@ -6,11 +6,14 @@ from jaxtyping import Bool, Float
 from numba import njit
 from torch import Tensor
 
-from dexgrasp.distance import DistanceField, Field, lower_bound, quick_bound, seed_at
+from dexgrasp.borrow import borrowed
+from dexgrasp.distance import DistanceField, Field, quick_bound, seed_at
 from dexgrasp.hand import Hand
 from dexgrasp.hand_body import HandBody, carry, hand_body, place_links
 from dexgrasp.triangle_tree import nearest
 
+FAR = 3e-3
+"""Of distances from a ball to the surface above this the grid's quickest bound will do, m."""
 CORES = 6
 """Balls of each link that are tried first."""
 SELF_OVERLAP = 5e-4
@@ -111,18 +114,15 @@ def as_arrays(pose: Tensor, joints: Tensor) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-FAR = 3e-3
-"""Of distances from a ball to the surface above this the grid's quickest bound will do, m."""
-
-
 @njit(cache=True)
 def deepest(body: HandBody, field: Field, poses: np.ndarray, ceiling: float, first: bool) -> float:
     """Return the least signed distance of the hand to the object where it is below `ceiling`, else `ceiling`.
 
     With `first`, any value below `ceiling` will do.
     """
-    best = ceiling
-    stack = np.empty(256, np.int64)
+    values, boxes, h = field.values, field.tree.boxes, field.spacing
+    a, b, c = field.origin
+    best, stack = ceiling, np.empty(256, np.int64)
     out = np.empty(7)
     for link in range(len(body.roots)):
         if body.roots[link] < 0:
@@ -134,7 +134,7 @@ def deepest(body: HandBody, field: Field, poses: np.ndarray, ceiling: float, fir
             node = stack[top]
             x, y, z = carry(poses, link, body.balls, node)
             radius = body.balls[node, 3]
-            if lower_bound(field, x, y, z) - radius >= best:
+            if quick_bound(values, boxes, a, b, c, h, x, y, z, radius + best) - radius >= best:
                 continue
             if body.children[node, 0] >= 0:
                 stack[top], stack[top + 1] = body.children[node, 0], body.children[node, 1]
@@ -150,6 +150,7 @@ def deepest(body: HandBody, field: Field, poses: np.ndarray, ceiling: float, fir
 
 @njit(cache=True)
 def _object_distances(body: HandBody, field: Field, bases: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    body, field, bases, joints = borrowed(body), borrowed(field), borrowed(bases), borrowed(joints)
     found = np.empty(len(bases))
     full, poses = np.empty(len(body.offset)), np.empty((len(body.parents), 3, 4))
     for i in range(len(bases)):
@@ -168,6 +169,7 @@ def _approaches(
     retreat: float,
     limit: float,
 ) -> np.ndarray:
+    body, field, bases, joints = borrowed(body), borrowed(field), borrowed(bases), borrowed(joints)
     clear, every = np.ones(len(bases), np.bool_), np.ones(len(body.parents), np.bool_)
     full, poses = np.empty(len(body.offset)), np.empty((len(body.parents), 3, 4))
     for i in range(len(bases)):
@@ -241,6 +243,7 @@ def _heights(body: HandBody, bases: np.ndarray, joints: np.ndarray) -> np.ndarra
 @njit(cache=True)
 def _self_collisions(body: HandBody, pairs: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """Return (N, Q) whether each pair of links overlaps, by descending both ball trees."""
+    body, pairs, joints = borrowed(body), borrowed(pairs), borrowed(joints)
     found = np.zeros((len(joints), len(pairs)), np.bool_)
     full, poses, base = np.empty(len(body.offset)), np.empty((len(body.parents), 3, 4)), np.eye(4)[:3]
     stack = np.empty((1024, 2), np.int64)
@@ -273,6 +276,7 @@ def _self_collisions(body: HandBody, pairs: np.ndarray, joints: np.ndarray) -> n
 
 @njit(cache=True)
 def _cloud_depths(body: HandBody, cloud: np.ndarray, bases: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    body, cloud, bases, joints = borrowed(body), borrowed(cloud), borrowed(bases), borrowed(joints)
     found = np.zeros(len(bases))
     full, poses = np.empty(len(body.offset)), np.empty((len(body.parents), 3, 4))
     parts = len(body.part_links)

@@ -8,6 +8,7 @@ import torch
 import trimesh
 from numba import njit
 
+from dexgrasp.borrow import borrowed
 from dexgrasp.errors import DexgraspError
 from dexgrasp.quality import Array
 from dexgrasp.triangle_tree import TriangleTree, nearest, to_box, to_triangle, triangle_tree
@@ -82,7 +83,7 @@ class DistanceField:
 def _fill(
     tree: TriangleTree, origin: np.ndarray, spacing: float, nx: int, ny: int, nz: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    values = np.empty((nx, ny, nz), np.float32)
+    tree, values = borrowed(tree), np.empty((nx, ny, nz), np.float32)
     seeds = np.empty((nx, ny, nz), np.int32)
     out = np.empty(7)
     seed = 0
@@ -122,25 +123,6 @@ def _fill(
                 values[i, j, k] = lower - ROUNDING
                 seeds[i, j, k] = seed
     return values, seeds
-
-
-@njit(cache=True)
-def lower_bound(field: Field, x: float, y: float, z: float) -> float:
-    """Return a lower bound of the signed distance at a point (m), from the eight grid nodes about it."""
-    h = field.spacing
-    u, v, w = (x - field.origin[0]) / h, (y - field.origin[1]) / h, (z - field.origin[2]) / h
-    nx, ny, nz = field.values.shape
-    if u < 0 or v < 0 or w < 0 or u > nx - 1 or v > ny - 1 or w > nz - 1:
-        return math.sqrt(to_box(field.tree.boxes, 0, x, y, z))
-    i, j, k = min(int(u), nx - 2), min(int(v), ny - 2), min(int(w), nz - 2)
-    u, v, w = u - i, v - j, w - k
-    best = -np.inf
-    for a in range(2):
-        for b in range(2):
-            for c in range(2):
-                away = math.sqrt((u - a) * (u - a) + (v - b) * (v - b) + (w - c) * (w - c))
-                best = max(best, field.values[i + a, j + b, k + c] - h * away)
-    return best
 
 
 @njit(cache=True, error_model="numpy")
@@ -252,7 +234,7 @@ def nearly(field: Field, x: float, y: float, z: float, out: np.ndarray) -> None:
 
 @njit(cache=True)
 def _nearest(field: Field, points: np.ndarray) -> np.ndarray:
-    found = np.empty((len(points), 7))
+    field, found = borrowed(field), np.empty((len(points), 7))
     for i in range(len(points)):
         x, y, z = points[i]
         nearest(field.tree, x, y, z, seed_at(field, x, y, z), found[i])
@@ -261,22 +243,24 @@ def _nearest(field: Field, points: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def _bounds(field: Field, points: np.ndarray) -> np.ndarray:
-    found = np.empty(len(points))
+    field, found = borrowed(field), np.empty(len(points))
+    boxes, (a, b, c) = field.tree.boxes, field.origin
     for i in range(len(points)):
-        found[i] = lower_bound(field, points[i, 0], points[i, 1], points[i, 2])
+        x, y, z = points[i]
+        found[i] = quick_bound(field.values, boxes, a, b, c, field.spacing, x, y, z, np.inf)
     return found
 
 
 @njit(cache=True)
 def _distances(field: Field, points: np.ndarray) -> np.ndarray:
-    found = np.empty(len(points))
+    field, found = borrowed(field), np.empty(len(points))
     out = np.empty(7)
     nx, ny, nz = field.values.shape
     for i in range(len(points)):
         x, y, z = points[i]
         u = (points[i] - field.origin) / field.spacing
         if u.min() < 0 or u[0] > nx - 1 or u[1] > ny - 1 or u[2] > nz - 1:
-            found[i] = lower_bound(field, x, y, z)
+            found[i] = math.sqrt(to_box(field.tree.boxes, 0, x, y, z))
         else:
             nearest(field.tree, x, y, z, seed_at(field, x, y, z), out)
             found[i] = out[0]
