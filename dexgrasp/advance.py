@@ -8,18 +8,20 @@ from numba import njit
 from dexgrasp.distance import Field, interpolated, quick_bound, seed_at
 from dexgrasp.hand_body import HandBody, carry, place_link
 from dexgrasp.patch_distance import SCRATCH, move_patch, patch_time
-from dexgrasp.triangle_tree import nearest
+from dexgrasp.triangle_tree import TriangleTree, nearest
 
-TOUCH = 4e-5
+TOUCH = 4.5e-5
 """A finger touches where the gap is at most this, m."""
-SPARE = TOUCH / 2
+SPARE = 5e-6
 """Steps leave this much, m: links must not stop in the surface itself, where rounding decides."""
-NEAR = 0.5
+NEAR = 0.7
 """A bounding ball is split once the surface is nearer than this many times what splitting may gain."""
-CLOSE = 5e-4
+CLOSE = 3e-4
 """Below this the grid's lower bound gives way to distances to triangles, m."""
 FAR = 3e-3
 """Of distances from a ball to the surface above this the grid's quickest bound will do, m."""
+APART = 1e-5
+"""Which side of the surface a normal points to is told this far from it, m."""
 REACH = 5e-3
 """Triangles farther than this from a link are not looked at, m."""
 AHEAD = 1.0
@@ -145,6 +147,8 @@ def advance(
                     min(min(pause, end) - time, REACH / patch_speeds[node]), TOUCH, SPARE, work, hit,
                 )  # fmt: skip
                 if clear < 0:
+                    if time == 0:
+                        _face_outwards(tree, seed, hit)
                     for c in range(links):
                         free[chain[c]] |= time > 0
                     return link
@@ -161,6 +165,16 @@ def advance(
     for c in range(links):
         free[chain[c]] = True
     return -1
+
+
+@njit(cache=True, error_model="numpy")
+def _face_outwards(tree: TriangleTree, seed: int, hit: np.ndarray) -> None:
+    """Turn the normal of a touch round where a patch that starts inside the object touches it from there."""
+    probe = np.empty(7)
+    nearest(tree, hit[1] + APART * hit[4], hit[2] + APART * hit[5], hit[3] + APART * hit[6], seed, probe)
+    if probe[0] < 0:
+        for i in range(4, 7):
+            hit[i] = -hit[i]
 
 
 @njit(cache=True, error_model="numpy")

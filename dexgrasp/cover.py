@@ -17,7 +17,7 @@ from dexgrasp.kinematics import LinkRecord
 
 PIECE = 2.5e-3
 """Patches are made of pieces of faces, with edges of at most this, m."""
-TOLERANCE = 1e-3
+TOLERANCE = 1.3e-3
 """How far balls may stand out, m; but more at sharp edges."""
 STILL = 1e-9
 """Speed of what does not move, such as centres on a joint's axis, m."""

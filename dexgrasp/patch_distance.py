@@ -9,7 +9,7 @@ from dexgrasp.triangle_tree import to_box, to_triangle
 SCRATCH = (6, 4, 3)
 """Shape of the array that `patch_time` works in."""
 
-ENOUGH = 0.6
+ENOUGH = 0.4
 """A triangle that is told to be reached no sooner than after this part of the time known so far needs no other look."""
 
 
