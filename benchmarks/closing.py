@@ -73,15 +73,15 @@ class Scan:
             low, high = 0.0, math.inf
             for step in range(steps + 1):
                 time = end * step / steps
-                if self._collides(pose, start + rate * time, moved, parts):
+                if self._collides(pose, np.clip(start + rate * time, *body.limits.T), moved, parts):
                     high = time
                     break
                 low = time
             while math.isfinite(high) and (high - low) * speed > FINE:
                 middle = (low + high) / 2
-                inside = self._collides(pose, start + rate * middle, moved, parts)
+                inside = self._collides(pose, np.clip(start + rate * middle, *body.limits.T), moved, parts)
                 low, high = (low, middle) if inside else (middle, high)
-            full = start + rate * low
+            full = np.clip(start + rate * low, *body.limits.T)
         return full
 
     def _collides(
