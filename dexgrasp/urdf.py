@@ -16,7 +16,7 @@ from dexgrasp.fingertip import fit_fingertip
 from dexgrasp.hand import Finger, Hand
 from dexgrasp.kinematics import KinematicTree, LinkRecord
 from dexgrasp.urdf_file import UrdfFile
-from dexgrasp.urdf_geometry import convex, joined, link_meshes
+from dexgrasp.urdf_geometry import convex_pieces, joined, link_meshes
 
 VIRTUAL_REACH = 0.03
 """Distance from fingertip centre to the virtual outer joint of a prismatic finger, m."""
@@ -40,6 +40,12 @@ class UrdfHand(Hand):
         shared: independent joints that are main joints of every finger.
         root: link at which the hand begins, where the URDF holds a whole arm; the base frame is its frame.
         palm: a link whose frame is the palm frame, or {origin, approach} in the base frame.
+        couplings: {joint: {joint, multiplier (1), offset (0)}}, in place of `<mimic>` tags that are wrong or missing;
+            null frees a joint.
+        limits: {joint: [lower, upper]}, rad or m, in place of the URDF's.
+        efforts: {joint: N m or N}, in place of the URDF's, which often are not the real ones.
+        collision: `given` (the URDF's `<collision>`) or `visual`; default: `given`, where the URDF has none at all
+            `visual`. What is not convex is cut into convex parts (see `convex_pieces`).
         model: nothing but a key that the YAML's `urdf` may be composed from, where a hand comes in several models.
 
     Raises:
@@ -55,10 +61,16 @@ class UrdfHand(Hand):
         shared: Sequence[str] = (),
         root: str | None = None,
         palm: str | Mapping[str, Sequence[float]] | None = None,
+        couplings: Mapping[str, Mapping[str, Any] | None] | None = None,
+        limits: Mapping[str, Sequence[float]] | None = None,
+        efforts: Mapping[str, float] | None = None,
+        collision: str | None = None,
         model: str | None = None,
     ) -> None:
         self.name, self.urdf = name, Path(urdf)
-        file = UrdfFile(self.urdf, root)
+        self.couplings = dict(couplings or {})
+        """What replaces `<mimic>` tags of the URDF."""
+        file = UrdfFile(self.urdf, root, couplings, limits, efforts)
         self.model = file.model()
         self.kinematics = KinematicTree(self.model)
         self.tree: tuple[LinkRecord, ...] = self.kinematics.records
@@ -71,8 +83,12 @@ class UrdfHand(Hand):
         self.masses = file.masses()
         visuals = link_meshes(file.robot, "visual", self.urdf)
         self.visuals = {link: joined(meshes) for link, meshes in visuals.items()}
-        collisions = link_meshes(file.robot, "collision", self.urdf)
-        self.collisions = {link: tuple(convex(mesh, link) for mesh in meshes) for link, meshes in collisions.items()}
+        self._known([] if collision is None else [collision], ("given", "visual"), "source of collision geometry")
+        solids = {} if collision == "visual" else link_meshes(file.robot, "collision", self.urdf)
+        solids = visuals if collision == "visual" or not (solids or collision) else solids
+        self.collisions = {
+            link: tuple(part for mesh in meshes for part in convex_pieces(mesh, link)) for link, meshes in solids.items()
+        }
         self._known(shared, self.joint_names, "shared joint")
         self.shared = tuple(joint for joint in self.joint_names if joint in shared)
         self.base_T_palm = self._palm(palm)
