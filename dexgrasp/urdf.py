@@ -87,7 +87,8 @@ class UrdfHand(Hand):
         solids = {} if collision == "visual" else link_meshes(file.robot, "collision", self.urdf)
         solids = visuals if collision == "visual" or not (solids or collision) else solids
         self.collisions = {
-            link: tuple(part for mesh in meshes for part in convex_pieces(mesh, link)) for link, meshes in solids.items()
+            link: tuple(part for mesh in meshes for part in convex_pieces(mesh, link))
+            for link, meshes in solids.items()
         }
         self._known(shared, self.joint_names, "shared joint")
         self.shared = tuple(joint for joint in self.joint_names if joint in shared)
@@ -191,6 +192,8 @@ class UrdfHand(Hand):
             center, radius = fit_fingertip(self._solid(path[-1].name), origin, axis, distal)
         if slides:
             origin = center - VIRTUAL_REACH * (direction + distal) / math.sqrt(2)
+        else:  # the point of the joint's axis in the circle's plane
+            origin = origin + ((center - origin) @ axis) * axis
         if "outer_joint" in given:
             origin = np.array(given["outer_joint"], dtype=np.float64)
         return radius, center, origin.copy(), axis
