@@ -3,7 +3,10 @@
 import argparse
 from importlib import import_module
 
-ACTIONS = {"check": "look a hand over: what is wrong, why it matters, how to mend it"}
+ACTIONS = {
+    "init": "write a hand's plugin folder from a URDF or MJCF file",
+    "check": "look a hand over: what is wrong, why it matters, how to mend it",
+}
 """Each is a module `dexgrasp.commands.hand_<action>` with `add_arguments(parser)` and `run(chosen)`."""
 
 

@@ -1,0 +1,120 @@
+"""The fingertip of a finger as the contact representation wants it: circle, closing axis, mid-plane."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from dexgrasp.errors import DexgraspError
+from dexgrasp.fingertip import fit_fingertip
+from dexgrasp.hand_init.fingers import FingerGuess, middle
+from dexgrasp.hand_init.guess import Guesses
+from dexgrasp.hand_init.model import Model
+
+ASIDE = 0.001
+"""A joint's origin may lie this far off the fingertip's middle along the axis, m."""
+REACH = 0.03
+"""Distance from the tip's centre to the virtual outer joint of a slide, m (METHOD section 1)."""
+
+
+@dataclass
+class Fingertip:
+    """In the distal link's coordinates, m."""
+
+    radius: float
+    center: Float[ndarray, "3"]
+    axis: Float[ndarray, "3"]
+    """Turning about it presses the tip into the object."""
+    joint: Float[ndarray, "3"]
+    """The outer joint, in the plane of the circle."""
+    explicit: bool
+    """Whether the YAML must tell it: the default, fitted in the plane through the joint's origin, is another."""
+
+
+def find_fingertip(model: Model, finger: FingerGuess, approach: np.ndarray, guesses: Guesses) -> Fingertip:
+    """Fit the fingertip's circle; `approach` is the palm's direction in root coordinates."""
+    poses = model.poses(middle(model))
+    root_T_link = poses[finger.link][0]
+    link_T_joint = np.linalg.inv(root_T_link) @ poses[finger.last.child][0]
+    origin, slide = link_T_joint[:3, 3], link_T_joint[:3, :3] @ finger.last.axis
+    tip = link_T_joint[:3, :3] @ finger.tip + origin
+    mesh = model.links[finger.link].mesh
+    assert mesh is not None
+    velocity = _velocity(model, finger, tip)
+    topic, explicit, distal = f"fingers.{finger.name}.tip", False, None
+    if finger.last.kind == "prismatic":
+        direction = slide * np.sign(slide @ velocity)
+        distal = root_T_link[:3, :3].T @ approach
+        distal = distal - (distal @ direction) * direction
+        if np.linalg.norm(distal) < 0.3:
+            distal = tip - origin - ((tip - origin) @ direction) * direction
+        distal /= np.linalg.norm(distal)
+        axis = np.cross(distal, direction)
+    else:
+        spoke = tip - origin - ((tip - origin) @ slide) * slide
+        axis = slide * (np.sign(np.cross(slide, spoke) @ velocity) or 1.0)
+        # What `UrdfHand` takes without being told: the sign in which closing turns the last joint.
+        lead = model.driver(finger.last.name)
+        turns = lead.rate * finger.closing.get(lead.joint, 0.0)
+        if (turns < 0) != (axis @ slide < 0):
+            explicit = True
+            guesses.add(topic, "the last joint turns outwards while the finger closes: a linkage; axis told", "likely")
+    plane = origin
+    near = np.asarray(mesh.vertices)[
+        np.linalg.norm(mesh.vertices - tip, axis=1) < 0.5 * np.ptp(mesh.vertices @ axis) + 0.004
+    ]
+    along = (near if len(near) else np.asarray(mesh.vertices)) @ axis
+    aside = (along.max() + along.min()) / 2 - origin @ axis
+    if abs(aside) > ASIDE:
+        plane, explicit = origin + round(aside, 5) * axis, True
+        guesses.add(
+            topic, f"the joint's origin lies {abs(aside) * 1e3:.1f} mm beside the tip's middle: moved there", "likely"
+        )
+    try:
+        center, radius = fit_fingertip(mesh, plane, axis, distal)
+    except DexgraspError:
+        center, radius, explicit = tip - 0.008 * _unit(tip - plane), 0.008, True
+        center = center - ((center - plane) @ axis) * axis
+        guesses.add(topic, "no circle could be fitted: 8 mm at the end of the mesh was taken; look at it", "UNSURE")
+    outer = center - REACH * _unit(direction + distal) if distal is not None else plane
+    _judge(mesh, plane, center, radius, axis, outer, topic, guesses)
+    return Fingertip(radius, center, axis, outer, explicit)
+
+
+def _velocity(model: Model, finger: FingerGuess, tip: np.ndarray) -> np.ndarray:
+    """Return how the tip moves when the finger closes, in the coordinates of its link in mid-posture."""
+    start = middle(model)
+    step = {joint: start[joint] + 1e-6 * rate for joint, rate in finger.closing.items()}
+    before, after = (model.poses({**start, **values})[finger.link][0] for values in ({}, step))
+    moved = (after[:3, :3] - before[:3, :3]) @ tip + after[:3, 3] - before[:3, 3]
+    return before[:3, :3].T @ moved / 1e-6
+
+
+def _judge(
+    mesh: object, plane: np.ndarray, center: np.ndarray, radius: float, axis: np.ndarray, outer: np.ndarray, topic: str,
+    guesses: Guesses,
+) -> None:  # fmt: skip
+    """Note how far the link's outline, where it touches, is from the circle: -30 to 90 deg from its end."""
+    import trimesh
+
+    assert isinstance(mesh, trimesh.Trimesh)
+    u = _unit(outer - center)
+    pad = -np.cross(axis, u)
+    lines = trimesh.intersections.mesh_plane(mesh, axis, plane + 1e-7 * axis)
+    points = lines.reshape(-1, 3) - center if len(lines) else np.asarray(mesh.vertices) - center
+    toward = np.degrees(np.arctan2(points @ pad, -(points @ u)))
+    touching = points[(toward > -30) & (toward < 90)]
+    size = np.linalg.norm(touching - np.outer(touching @ axis, axis), axis=1) if len(touching) else np.array([radius])
+    worst = float(np.abs(size - radius).max())
+    found = (
+        f"circle of radius {radius * 1e3:.1f} mm; the outline is up to {worst * 1e3:.1f} mm from it where it touches"
+    )
+    if worst > max(0.3 * radius, 0.002):
+        guesses.add(topic, f"{found}: not a round tip", "UNSURE" if worst > 0.006 else "likely")
+    else:
+        guesses.add(topic, found, "sure" if worst < 0.1 * radius else "likely")
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)
