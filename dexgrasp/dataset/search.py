@@ -50,7 +50,8 @@ class Search:
     def __init__(self, hand: Hand, item: Object, surface: Surface, settings: SynthesisSettings) -> None:
         self.hand, self.item, self.surface, self.settings = hand, item, surface, settings
         self.body, self.shape, self.preview = hand_body(hand), HandShape(hand), Preview(hand)
-        self.model = WrenchModel(tuple(item.com), item.radius, settings.friction, settings.edges)
+        torsion = settings.soft(len(hand.fingers))
+        self.model = WrenchModel(tuple(item.com), item.radius, settings.friction, settings.edges, torsion)
         share = settings.approach
         self.proposers = [
             (palm, proposer, part)

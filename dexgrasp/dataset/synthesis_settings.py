@@ -5,12 +5,17 @@ from dataclasses import dataclass
 from dexgrasp.errors import DexgraspError
 
 
+TWO_FINGERS = 0.02
+"""Torsion of a hand with two fingers, m: hard contacts hold no torque about the line through them. As in `lift-v1`."""
+
+
 @dataclass(frozen=True)
 class SynthesisSettings:
     """How grasps are found and which are kept; see conf/synthesis/default.yaml for units and meaning."""
 
     friction: float = 0.5
     edges: int = 8
+    torsion: float | None = None
     epsilon: float = 0.05
     penetration: float = 0.001
     approach: float = 0.15
@@ -28,6 +33,10 @@ class SynthesisSettings:
     near_position: float = 0.01
     near_angle: float = 0.2
     near_joints: float = 0.2
+
+    def soft(self, fingers: int) -> float:
+        """Return the torsion (m) of the contacts of a hand with so many fingers."""
+        return (TWO_FINGERS if fingers == 2 else 0.0) if self.torsion is None else self.torsion
 
     def __post_init__(self) -> None:
         if min(self.batch, self.rounds, self.patience, self.target) < 1 or not (
