@@ -150,6 +150,10 @@ class UrdfHand(Hand):
         rates = torch.tensor([closing.get(joint, 0.0) for joint in self.joint_names], dtype=torch.float64)
         sign = -1.0 if float(matrix[joints[-1].index] @ rates) < 0 else 1.0
         geometry = self._tip(given, path, sign)
+        if "closing_axis" not in given and joints[-1].kind == "revolute":
+            # Of a linkage the last joint may turn back while the finger closes: what counts is where the tip goes.
+            moved = self._travel(link, geometry[1], rates) @ np.cross(geometry[3], geometry[2] - geometry[1])
+            geometry = (*geometry[:3], -geometry[3] if moved > 0 else geometry[3])
         return Finger(
             name=str(given.get("name", link)),
             link=link,
@@ -197,6 +201,13 @@ class UrdfHand(Hand):
         if "outer_joint" in given:
             origin = np.array(given["outer_joint"], dtype=np.float64)
         return radius, center, origin.copy(), axis
+
+    def _travel(self, link: str, point: np.ndarray, rates: Float[Tensor, "J"]) -> np.ndarray:
+        """Return how a link's point moves, in link coordinates, when joints in the middle of their ranges do at `rates`."""
+        middle, step = self.limits.mean(dim=1), 1e-4
+        near = self.link_poses(torch.stack([middle - step * rates, middle + step * rates]))[link].numpy()
+        ends = near[:, :3, :3] @ point + near[:, :3, 3]
+        return (ends[1] - ends[0]) @ near[0, :3, :3]
 
     def _path(self, link: str) -> list[LinkRecord]:
         path, number = [], self.link_names.index(link)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 from dexgrasp.errors import DexgraspError
 
-
 TWO_FINGERS = 0.02
 """Torsion of a hand with two fingers, m: hard contacts hold no torque about the line through them. As in `lift-v1`."""
 
