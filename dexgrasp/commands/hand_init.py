@@ -1,6 +1,7 @@
 """Write a hand's plugin folder from a URDF or MJCF file.
 
-Palm, fingers, closing joints, fingertips and collision shapes are found. Every guess is told, with how sure it is: as a comment in the YAML, in the README, and here.
+Palm, fingers, closing joints, fingertips and collision shapes are found. Every guess is told, with how sure it is: as
+a comment in the YAML, in the README, and here.
 """
 
 import argparse

@@ -29,6 +29,8 @@ class Anatomy:
     model: Model
     palm: list[str]
     """Links of the palm: fixed to each other, the fingers' first joints on them."""
+    core: list[str]
+    """Those of them from the last branching on, if they have a shape: without mounts and sensors below."""
     chains: list[Chain]
 
 
@@ -87,7 +89,8 @@ def find_hand(model: Model, root: str | None, guesses: Guesses) -> Anatomy:
     palm_top = start if start in groups[top] else top
     palm = [name for name in rigid(model, palm_top)]
     chains = [_chain(model, tip, palm) for tip in tips[top]]
-    return Anatomy(model, palm, chains)
+    core = rigid(model, _common(model, palm_top, [chain.joints[0] for chain in chains]))
+    return Anatomy(model, palm, core if any(model.links[link].solid for link in core) else palm, chains)
 
 
 def _tips(model: Model, groups: dict[str, list[str]], below: dict[str, list[str]], name: str) -> list[str]:
@@ -126,18 +129,23 @@ def _start(model: Model, group: list[str], first: list[Joint]) -> str:
     """
     if group[0] == model.root:
         return group[0]
-    common: list[str] | None = None
-    for joint in first:
-        way = [model.above[link].child if link in model.above else link for link in _up(model, joint.parent, group)]
-        common = way if common is None else [link for link in common if link in way]
-    way = common or [group[0]]  # from the lowest common link up to the group's first
+    way = _up(model, _common(model, group[0], first), group[0])  # up to the group's first
     solid = [link for link in way[:-1] if model.links[link].solid]
     return solid[-1] if solid else way[0]
 
 
-def _up(model: Model, link: str, group: list[str]) -> list[str]:
+def _common(model: Model, top: str, joints: list[Joint]) -> str:
+    """Return the lowest link on which, or fixed above which, all these joints are; `top` is the highest."""
+    common = _up(model, joints[0].parent, top)
+    for joint in joints[1:]:
+        way = _up(model, joint.parent, top)
+        common = [link for link in common if link in way]
+    return common[0]
+
+
+def _up(model: Model, link: str, top: str) -> list[str]:
     way = [link]
-    while way[-1] != group[0]:
+    while way[-1] != top:
         way.append(model.above[way[-1]].parent)
     return way
 

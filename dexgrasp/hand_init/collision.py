@@ -16,10 +16,10 @@ from dexgrasp.urdf_geometry import convex_pieces, joined
 
 FAR, FAR_TIP = 0.004, 0.002
 """Given collision shapes that are farther (95 %) from the visual ones are made anew, m; on distal links."""
-MOST, COARSER = 12, (0.008, 0.016, 0.03)
+MOST, COARSE = 12, 0.016
 """A link of more parts is cut less finely: slower for nothing; twice the depth of dents that may be filled, m."""
-FACES = 20000
-"""A mesh of more is simplified before it is cut."""
+FACES, CUT = 20000, 3000
+"""A mesh of more faces is simplified before it is written, and before it is cut."""
 log = logging.getLogger(__name__)
 
 
@@ -132,12 +132,10 @@ def _parts(
 def _cut(mesh: trimesh.Trimesh, link: str) -> tuple[trimesh.Trimesh, ...] | None:
     """Return a mesh as not too many convex parts; None where that fails."""
     try:
+        # An open mesh is closed by voxels first, whose time grows with the faces.
+        mesh = _light(mesh, CUT)
         parts = convex_pieces(mesh, link)
-        for depth in COARSER:
-            if len(parts) <= MOST:
-                break
-            parts = convex_parts(mesh, depth)
-        return parts
+        return parts if len(parts) <= MOST else convex_parts(mesh, COARSE)
     except Exception as error:  # the decomposition has its own on broken meshes
         log.debug("%s: %s", link, error)
         return None
@@ -172,15 +170,15 @@ def _fit(link: Link, source: str, mesh: trimesh.Trimesh) -> Fit:
     return Fit(link.name, source, len(link.parts), float(np.quantile(outside, 0.95)), float(np.quantile(beyond, 0.95)))
 
 
-def _light(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a mesh of at most `FACES` faces."""
+def _light(mesh: trimesh.Trimesh, most: int = FACES) -> trimesh.Trimesh:
+    """Return a mesh of at most `most` faces."""
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces)
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    if len(mesh.faces) <= FACES:
+    if len(mesh.faces) <= most:
         return mesh
     import fast_simplification
 
     points, faces = fast_simplification.simplify(
-        np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.int32), target_count=FACES
+        np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.int32), target_count=most
     )
     return trimesh.Trimesh(points.astype(float), faces)

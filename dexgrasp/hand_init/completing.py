@@ -10,6 +10,8 @@ from dexgrasp.hand_init.model import Inertia, Joint, Model
 
 WIDEST = {"revolute": 4.2, "prismatic": 0.3}
 """No finger joint moves farther, rad or m: a range beyond stands for none."""
+BEND = 1.2
+"""A finger's joint without limits bends at least this far, rad."""
 TIP_FORCE = 15.0
 """What a finger presses with where the model does not say, N."""
 STRONGEST, STRONG = 1000.0, 60.0
@@ -152,7 +154,9 @@ def _closing_range(model: Model, fingers: list[FingerGuess], joint: Joint, rate:
     nearest = float(values[apart.argmin()])
     small = 0.15 if joint.kind == "revolute" else 0.004
     # Zero is open, as usual, unless the tips are together there.
+    # A finger may bend beyond, round an object.
     start, stop = (0.0, nearest) if nearest > small else (-0.6 * width, max(nearest, 0.0))
+    stop = max(stop, BEND) if joint.kind == "revolute" and start == 0 else stop
     ends = sorted((rate * start, rate * stop))
     return round(ends[0], 4), round(ends[1], 4)
 

@@ -12,8 +12,6 @@ from dexgrasp.hand_init.fingers import FingerGuess, middle
 from dexgrasp.hand_init.guess import Guesses
 from dexgrasp.hand_init.model import Model
 
-ASIDE = 0.001
-"""A joint's origin may lie this far off the fingertip's middle along the axis, m."""
 REACH = 0.03
 """Distance from the tip's centre to the virtual outer joint of a slide, m (METHOD section 1)."""
 
@@ -28,8 +26,8 @@ class Fingertip:
     """Turning about it presses the tip into the object."""
     joint: Float[ndarray, "3"]
     """The outer joint, in the plane of the circle."""
-    explicit: bool
-    """Whether the YAML must tell it: the default, fitted in the plane through the joint's origin, is another."""
+    told: tuple[str, ...] = ()
+    """Keys that the YAML must tell: what `UrdfHand` takes by itself would be another."""
 
 
 def find_fingertip(model: Model, finger: FingerGuess, approach: np.ndarray, guesses: Guesses) -> Fingertip:
@@ -42,7 +40,8 @@ def find_fingertip(model: Model, finger: FingerGuess, approach: np.ndarray, gues
     mesh = model.links[finger.link].mesh
     assert mesh is not None
     velocity = _velocity(model, finger, tip)
-    topic, explicit, distal = f"fingers.{finger.name}.tip", False, None
+    topic, distal = f"fingers.{finger.name}.tip", None
+    told: tuple[str, ...] = ()
     if finger.last.kind == "prismatic":
         direction = slide * np.sign(slide @ velocity)
         distal = root_T_link[:3, :3].T @ approach
@@ -58,28 +57,20 @@ def find_fingertip(model: Model, finger: FingerGuess, approach: np.ndarray, gues
         lead = model.driver(finger.last.name)
         turns = lead.rate * finger.closing.get(lead.joint, 0.0)
         if (turns < 0) != (axis @ slide < 0):
-            explicit = True
+            told = ("closing_axis",)
             guesses.add(topic, "the last joint turns outwards while the finger closes: a linkage; axis told", "likely")
-    plane = origin
-    near = np.asarray(mesh.vertices)[
-        np.linalg.norm(mesh.vertices - tip, axis=1) < 0.5 * np.ptp(mesh.vertices @ axis) + 0.004
-    ]
-    along = (near if len(near) else np.asarray(mesh.vertices)) @ axis
-    aside = (along.max() + along.min()) / 2 - origin @ axis
-    if abs(aside) > ASIDE:
-        plane, explicit = origin + round(aside, 5) * axis, True
-        guesses.add(
-            topic, f"the joint's origin lies {abs(aside) * 1e3:.1f} mm beside the tip's middle: moved there", "likely"
-        )
     try:
-        center, radius = fit_fingertip(mesh, plane, axis, distal)
+        center, radius = fit_fingertip(mesh, origin, axis, distal)
     except DexgraspError:
-        center, radius, explicit = tip - 0.008 * _unit(tip - plane), 0.008, True
-        center = center - ((center - plane) @ axis) * axis
+        center, radius, told = tip - 0.008 * _unit(tip - origin), 0.008, ("tip_radius", "tip_center", *told)
         guesses.add(topic, "no circle could be fitted: 8 mm at the end of the mesh was taken; look at it", "UNSURE")
+    plane = origin + ((center - origin) @ axis) * axis
+    if abs((plane - origin) @ axis) > 1e-6:
+        aside = abs((plane - origin) @ axis) * 1e3
+        guesses.add(topic, f"the tip's middle lies {aside:.1f} mm aside of the joint's origin: cut there", "likely")
     outer = center - REACH * _unit(direction + distal) if distal is not None else plane
     _judge(mesh, plane, center, radius, axis, outer, topic, guesses)
-    return Fingertip(radius, center, axis, outer, explicit)
+    return Fingertip(radius, center, axis, outer, told)
 
 
 def _velocity(model: Model, finger: FingerGuess, tip: np.ndarray) -> np.ndarray:

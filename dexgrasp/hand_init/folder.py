@@ -46,9 +46,9 @@ Written by `python -m dexgrasp hand init {file}`.
 
 ## The model and its source
 
-Source: {file}. Licence: UNKNOWN, look it up before you pass this folder on, and write it here and into pyproject.toml.
-`dexgrasp_{name}/urdf/{name}.urdf` is the hand alone, in metres, couplings resolved; `meshes/*.stl` what one sees and the
-convex parts that collide.
+Source: {file}. Licence: UNKNOWN; look it up before you pass this folder on, write it here and into pyproject.toml.
+`dexgrasp_{name}/urdf/{name}.urdf` is the hand alone, in metres, couplings resolved;
+`meshes/*.stl` is what one sees, and the convex parts that collide.
 
 ## What was guessed
 
@@ -158,13 +158,11 @@ def yaml_text(
         lines += [f"  - name: {_word(finger.name)}", f"    link: {_word(finger.link)}"]
         closing = ", ".join(f"{_word(joint)}: {rate:g}" for joint, rate in finger.closing.items())
         lines.append(f"    closing: {{{closing}}}  # joint: rate; 1 is towards its upper limit")
-        mark = "    " if tip.explicit else "    # "
-        if not tip.explicit:
-            lines.append("    # Fitted anew from the mesh unless told here (link coordinates):")
-        lines.append(f"{mark}tip_radius: {tip.radius:.6g}")
-        lines.append(f"{mark}tip_center: {_list(tip.center, 12)}")
-        lines.append(f"{mark}outer_joint: {_list(tip.joint, 12)}")
-        lines.append(f"{mark}closing_axis: {_list(tip.axis, 12)}")
+        numbers = {"tip_radius": f"{tip.radius:.6g}", "tip_center": _list(tip.center, 12)}
+        numbers |= {"outer_joint": _list(tip.joint, 12), "closing_axis": _list(tip.axis, 12)}
+        lines += [f"    {key}: {numbers[key]}" for key in numbers if key in tip.told]
+        lines.append("    # Link coordinates; found from mesh and joint again unless told here:")
+        lines += [f"    # {key}: {value}" for key, value in numbers.items() if key not in tip.told]
     return "\n".join(lines) + "\n"
 
 

@@ -49,6 +49,13 @@ def init_hand(
     guesses = Guesses()
     model = read_model(path, guesses)
     anatomy = find_hand(model, root, guesses)
+    loose = [joint.name for joint in anatomy.model.joints.values() if joint.kind == "floating"]
+    if loose:
+        raise DexgraspError(
+            "joints of one degree of freedom in the hand",
+            f"{', '.join(loose)} in {path}",
+            "split them into hinges and slides, or name a lower link: root=...",
+        )
     name = _name(name, model.name, path)
     target = (out or Path(name)).absolute()
     refuse(target)
@@ -81,6 +88,10 @@ def read_model(path: Path, guesses: Guesses) -> Model:
         ) from error
     if robot.tag == "robot":
         return read_urdf(path, robot, guesses)
+    if robot.tag == "mujoco":
+        from dexgrasp.hand_init.mjcf_source import read_mjcf
+
+        return read_mjcf(path, guesses)
     raise DexgraspError("a URDF (<robot>) or an MJCF file (<mujoco>)", f"<{robot.tag}> in {path}", "name another file")
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 from numpy import ndarray
+from scipy.spatial import cKDTree
 
 from dexgrasp.hand_init.anatomy import Anatomy
 from dexgrasp.hand_init.fingers import FingerGuess, span, tip_positions
@@ -17,6 +18,8 @@ TRIES = 48
 STEPS = 12
 BEAM = 0.025
 """Radius of the object that is thought to come in, m."""
+ROOM = 0.03
+"""The tips should meet this far from the palm, m."""
 SNAP = 0.15
 """An axis of the root frame is preferred to a better direction that is no more than this better."""
 
@@ -35,12 +38,13 @@ class Palm:
 def find_palm(anatomy: Anatomy, fingers: list[FingerGuess], guesses: Guesses) -> Palm:
     """Find the palm frame.
 
-    Of candidate directions (axes of the root, of the palm's mesh, the way in which fingers begin to close) that is taken
-    along which there is hand behind the place where the tips meet, none before it, and the palm lies behind.
+    Of candidate directions (axes of the root, of the palm's mesh, the way in which fingers begin to close) one is
+    taken along which there is hand behind the place where the tips meet, none before it, and the palm lies behind.
     """
     model = anatomy.model
-    opened, closed, center = _meeting(model, fingers)
-    points, palm, normals = _surface(model, anatomy.palm, opened)
+    _, palm, normals = _surface(model, anatomy.core, {})
+    opened, closed, center = _meeting(model, fingers, palm)
+    points, _, _ = _surface(model, [], opened)
     middle = palm.mean(axis=0) if len(palm) else _bases(model, fingers).mean(axis=0)
     out = center - middle
     candidates = [("an axis of the root frame", sign * axis) for axis in np.eye(3) for sign in (1, -1)]
@@ -73,9 +77,12 @@ def find_palm(anatomy: Anatomy, fingers: list[FingerGuess], guesses: Guesses) ->
 
 
 def _meeting(
-    model: Model, fingers: list[FingerGuess]
+    model: Model, fingers: list[FingerGuess], palm: np.ndarray
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray]:
-    """Return an open and a closed posture between which the tips oppose each other, and where they meet."""
+    """Return an open and a closed posture between which the tips oppose each other, and where they meet.
+
+    There must be room for an object between tips and palm: fists do not count.
+    """
     rng = np.random.default_rng(0)
     closing = {joint: rate for finger in fingers for joint, rate in finger.closing.items()}
     idle = [joint for joint in model.free if joint.name not in closing]
@@ -92,7 +99,10 @@ def _meeting(
     moves = np.gradient(tips, axis=1)
     moves /= np.maximum(np.linalg.norm(moves, axis=-1, keepdims=True), 1e-9)
     together = np.linalg.norm(moves.mean(axis=2), axis=-1)  # 0 where the tips oppose each other
-    place = np.unravel_index((apart + 0.05 * together).argmin(), apart.shape)
+    room = np.full(apart.shape, ROOM)
+    if len(palm):
+        room = np.minimum(cKDTree(palm).query(tips.mean(axis=2).reshape(-1, 3))[0].reshape(apart.shape), ROOM)
+    place = np.unravel_index((apart + 0.05 * together - 2 * room).argmin(), apart.shape)
     posture = {name: v[[place[0]]] for name, v in tries.items()}
     opened = posture | {j: np.array([low]) for j, (low, _) in ends.items()}
     closed = posture | {j: np.array([high]) for j, (_, high) in ends.items()}
