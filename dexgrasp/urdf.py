@@ -203,7 +203,7 @@ class UrdfHand(Hand):
         return radius, center, origin.copy(), axis
 
     def _travel(self, link: str, point: np.ndarray, rates: Float[Tensor, "J"]) -> np.ndarray:
-        """Return how a link's point moves, in link coordinates, when joints in the middle of their ranges do at `rates`."""
+        """Return how a link's point moves, in its coordinates, when joints move at `rates` in mid-range."""
         middle, step = self.limits.mean(dim=1), 1e-4
         near = self.link_poses(torch.stack([middle - step * rates, middle + step * rates]))[link].numpy()
         ends = near[:, :3, :3] @ point + near[:, :3, 3]

@@ -12,6 +12,7 @@ from torch import Tensor
 from dexgrasp.batch import Batch
 from dexgrasp.contact_frame import place, to_disc
 from dexgrasp.dataset.surface import Surface
+from dexgrasp.execution import opened
 from dexgrasp.geometry import inverse
 from dexgrasp.hand import Hand
 
@@ -129,21 +130,6 @@ class Contact(Proposer):
         points, normals = surface.points[draws.point], surface.normals[draws.point]
         pose = place(self.hand, draws.finger, points, normals, draws.place, draws.joints)
         return pose, opened(self.hand, draws.joints)
-
-
-def opened(hand: Hand, joints: Float[Tensor, "N J"]) -> Float[Tensor, "N J"]:
-    """Return the postures with every finger opened: back along its closing motion until a joint is at its limit.
-
-    Closing from there leads through `joints` again. A finger with one closing joint opens as far as it goes.
-    """
-    result = joints.clone()
-    for finger in hand.fingers:
-        places = hand.joint_index(tuple(finger.closing))
-        rates = torch.tensor(list(finger.closing.values()), dtype=joints.dtype)
-        ends = torch.where(rates > 0, *hand.limits[places].T.to(joints))
-        way = ((result[:, places] - ends) / rates).min(dim=1, keepdim=True).values
-        result[:, places] = result[:, places] - way * rates
-    return result
 
 
 def _points(surface: Surface, count: int, rng: np.random.Generator) -> Int[Tensor, "N"]:

@@ -4,9 +4,6 @@ from dataclasses import dataclass
 
 from dexgrasp.errors import DexgraspError
 
-TWO_FINGERS = 0.02
-"""Torsion of a hand with two fingers, m: hard contacts hold no torque about the line through them. As in `lift-v1`."""
-
 
 @dataclass(frozen=True)
 class SynthesisSettings:
@@ -32,10 +29,6 @@ class SynthesisSettings:
     near_position: float = 0.01
     near_angle: float = 0.2
     near_joints: float = 0.2
-
-    def soft(self, fingers: int) -> float:
-        """Return the torsion (m) of the contacts of a hand with so many fingers."""
-        return (TWO_FINGERS if fingers == 2 else 0.0) if self.torsion is None else self.torsion
 
     def __post_init__(self) -> None:
         if min(self.batch, self.rounds, self.patience, self.target) < 1 or not (
