@@ -44,6 +44,7 @@ class UrdfHand(Hand):
             null frees a joint.
         limits: {joint: [lower, upper]}, rad or m, in place of the URDF's.
         efforts: {joint: N m or N}, in place of the URDF's, which often are not the real ones.
+        allowed_contacts: pairs of links that may overlap, besides neighbours and what does so in the open posture.
         collision: `given` (the URDF's `<collision>`) or `visual`; default: `given`, where the URDF has none at all
             `visual`. What is not convex is cut into convex parts (see `convex_pieces`).
         model: nothing but a key that the YAML's `urdf` may be composed from, where a hand comes in several models.
@@ -64,6 +65,7 @@ class UrdfHand(Hand):
         couplings: Mapping[str, Mapping[str, Any] | None] | None = None,
         limits: Mapping[str, Sequence[float]] | None = None,
         efforts: Mapping[str, float] | None = None,
+        allowed_contacts: Sequence[Sequence[str]] = (),
         collision: str | None = None,
         model: str | None = None,
     ) -> None:
@@ -90,6 +92,8 @@ class UrdfHand(Hand):
             link: tuple(part for mesh in meshes for part in convex_pieces(mesh, link))
             for link, meshes in solids.items()
         }
+        self._known([link for pair in allowed_contacts for link in pair], self.link_names, "link")
+        self.allowed_contacts = tuple((str(first), str(second)) for first, second in allowed_contacts)
         self._known(shared, self.joint_names, "shared joint")
         self.shared = tuple(joint for joint in self.joint_names if joint in shared)
         self.base_T_palm = self._palm(palm)

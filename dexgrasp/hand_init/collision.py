@@ -12,10 +12,13 @@ from dexgrasp.hand_init.fingers import FingerGuess
 from dexgrasp.hand_init.guess import Guesses
 from dexgrasp.hand_init.mesh_files import placed
 from dexgrasp.hand_init.model import Link, Model
+from dexgrasp.shapes.solid import fibonacci
 from dexgrasp.urdf_geometry import convex_pieces, joined
 
 FAR, FAR_TIP = 0.004, 0.002
 """Given collision shapes that are farther (95 %) from the visual ones are made anew, m; on distal links."""
+CORNERS = 160
+"""A convex part of more is simplified: closing slows down with them."""
 MOST, COARSE = 12, 0.016
 """A link of more parts is cut less finely: slower for nothing; twice the depth of dents that may be filled, m."""
 FACES, CUT = 20000, 3000
@@ -134,11 +137,19 @@ def _cut(mesh: trimesh.Trimesh, link: str) -> tuple[trimesh.Trimesh, ...] | None
     try:
         # An open mesh is closed by voxels first, whose time grows with the faces.
         mesh = _light(mesh, CUT)
-        parts = convex_pieces(mesh, link)
+        parts = tuple(_few_corners(part) for part in convex_pieces(mesh, link))
         return parts if len(parts) <= MOST else convex_parts(mesh, COARSE)
     except Exception as error:  # the decomposition has its own on broken meshes
         log.debug("%s: %s", link, error)
         return None
+
+
+def _few_corners(part: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a convex body of at most `CORNERS` corners: those that are farthest in as many directions."""
+    if len(part.vertices) <= CORNERS:
+        return part
+    points = np.asarray(part.vertices)
+    return trimesh.convex.convex_hull(points[np.unique((points @ fibonacci(CORNERS).T).argmax(axis=0))])
 
 
 def _wrapped(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -3,6 +3,7 @@
 import shutil
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -68,20 +69,23 @@ Source: {file}. Licence: UNKNOWN; look it up before you pass this folder on, wri
 """
 
 
-def write_folder(
-    target: Path,
-    name: str,
-    anatomy: Anatomy,
-    fingers: list[FingerGuess],
-    tips: list[Fingertip],
-    palm: Palm,
-    shared: Sequence[str],
-    fits: Sequence[Fit],
-    guesses: Guesses,
-) -> Path:
+@dataclass(frozen=True)
+class Found:
+    """What is written of a hand."""
+
+    anatomy: Anatomy
+    fingers: list[FingerGuess]
+    tips: list[Fingertip]
+    palm: Palm
+    shared: Sequence[str]
+    allowed: Sequence[tuple[str, str]]
+    fits: Sequence[Fit]
+
+
+def write_folder(target: Path, name: str, found: Found, guesses: Guesses) -> Path:
     """Write the folder in one step; return the YAML's path. Raises DexgraspError where the folder is there already."""
     refuse(target)
-    model = anatomy.model
+    model, fingers = found.anatomy.model, found.fingers
     model.name = name
     with room("the hand's folder", target.parent):
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -92,7 +96,7 @@ def write_folder(
             (package / "conf" / "hand").mkdir(parents=True)
             names = ", ".join(finger.name for finger in fingers)
             (package / "__init__.py").write_text(f'"""{name}: {len(fingers)} fingers ({names})."""\n', encoding="utf-8")
-            text = yaml_text(name, fingers, tips, palm, shared, guesses, model.path.name)
+            text = yaml_text(name, found, guesses)
             (package / "conf" / "hand" / f"{name}.yaml").write_text(text, encoding="utf-8")
             (draft / "pyproject.toml").write_text(
                 PROJECT.format(name=name, dashed=name.replace("_", "-")), encoding="utf-8"
@@ -108,7 +112,7 @@ def write_folder(
                 guesses="\n".join(f"| {g.topic} | {g.confidence} | {g.text} |" for g in guesses.made),
                 fits="\n".join(
                     f"| {f.link} | {f.parts} | {f.source} | {f.outside * 1e3:.1f} | {f.beyond * 1e3:.1f} |"
-                    for f in fits
+                    for f in found.fits
                 ),
             )
             (draft / "README.md").write_text(readme, encoding="utf-8")
@@ -127,32 +131,30 @@ def refuse(target: Path) -> None:
         raise DexgraspError("a new folder for the hand", f"{target} is there already", "remove it, or say out=<folder>")
 
 
-def yaml_text(
-    name: str,
-    fingers: list[FingerGuess],
-    tips: list[Fingertip],
-    palm: Palm,
-    shared: Sequence[str],
-    guesses: Guesses,
-    source: str,
-) -> str:
+def yaml_text(name: str, found: Found, guesses: Guesses) -> str:
     """Return the hand's YAML; guesses stand as comments above what they led to."""
+    source, palm = found.anatomy.model.path.name, found.palm
     lines = _comment(
         f"{name}, written by `python -m dexgrasp hand init {source}`. What the model does not say outright was "
         "guessed: `sure` where two things agree, `likely` where one says so, `UNSURE` where you should look. "
         f"Units m and rad; frames are the URDF's. `python -m dexgrasp hand check` tries it."
     )
-    told = {"palm", "shared"} | {guess.topic for guess in guesses.made if guess.topic.startswith("fingers.")}
+    told = {"palm", "shared", "allowed_contacts"} | {
+        guess.topic for guess in guesses.made if guess.topic.startswith("fingers.")
+    }
     rest = [guess for guess in guesses.made if guess.topic not in told]
     lines += [f"name: {name}", f"urdf: ../../urdf/{name}.urdf  # relative to this file"]
     lines += [line for guess in rest for line in _told(guess)]
     lines += [line for guess in guesses.about("palm") for line in _told(guess)]
     lines.append(f"palm: {{origin: {_list(palm.origin, 4)}, approach: {_list(palm.approach, 6)}}}")
     lines += [line for guess in guesses.about("shared") for line in _told(guess)]
-    if shared:
-        lines.append(f"shared: [{', '.join(map(_word, shared))}]")
+    if found.shared:
+        lines.append(f"shared: [{', '.join(map(_word, found.shared))}]")
+    lines += [line for guess in guesses.about("allowed_contacts") for line in _told(guess)]
+    if found.allowed:
+        lines.append(f"allowed_contacts: [{', '.join(f'[{_word(a)}, {_word(b)}]' for a, b in found.allowed)}]")
     lines.append("fingers:")
-    for finger, tip in zip(fingers, tips, strict=True):
+    for finger, tip in zip(found.fingers, found.tips, strict=True):
         topics = (f"fingers.{finger.link}", f"fingers.{finger.name}.closing", f"fingers.{finger.name}.tip")
         lines += [f"  {line}" for topic in topics for guess in guesses.about(topic) for line in _told(guess)]
         lines += [f"  - name: {_word(finger.name)}", f"    link: {_word(finger.link)}"]

@@ -12,11 +12,12 @@ from dexgrasp.hand_init.collision import drop_envelopes, make_parts, read_visual
 from dexgrasp.hand_init.completing import complete_efforts, complete_inertias, complete_ranges, order_ranges
 from dexgrasp.hand_init.fingers import find_fingers
 from dexgrasp.hand_init.fingertip import find_fingertip
-from dexgrasp.hand_init.folder import refuse, write_folder
+from dexgrasp.hand_init.folder import Found, refuse, write_folder
 from dexgrasp.hand_init.guess import Guesses
 from dexgrasp.hand_init.mesh_files import read_shapes
 from dexgrasp.hand_init.model import Model
 from dexgrasp.hand_init.palm import find_palm
+from dexgrasp.hand_init.self_contact import find_allowed
 from dexgrasp.hand_init.urdf_source import read_urdf
 
 
@@ -72,7 +73,9 @@ def init_hand(
     fits = make_parts(model, fingers, guesses)
     complete_efforts(model, fingers, guesses)
     complete_inertias(model, guesses)
-    yaml = write_folder(target, name, anatomy, fingers, tips, palm, shared, fits, guesses)
+    allowed = find_allowed(model, guesses)
+    found = Found(anatomy, fingers, tips, palm, shared, allowed, fits)
+    yaml = write_folder(target, name, found, guesses)
     return Written(target, yaml, name, tuple(finger.name for finger in fingers), guesses)
 
 

@@ -1,5 +1,6 @@
 """Where the palm's face is and which way it looks: where an object may come into the open hand."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,12 +17,13 @@ from dexgrasp.hand_init.model import Model
 TRIES = 48
 """Postures of the joints that do not close, tried for the one in which the fingers oppose each other best."""
 STEPS = 12
-BEAM = 0.025
-"""Radius of the object that is thought to come in, m."""
+BEAM, CELL = 0.025, 0.004
+"""Radius of the object that is thought to come in, and of what it is made, m."""
 ROOM = 0.03
 """The tips should meet this far from the palm, m."""
 SNAP = 0.15
-"""An axis of the root frame is preferred to a better direction that is no more than this better."""
+"""An axis or diagonal of the root frame is preferred to a better direction that is no more than this better."""
+DIAGONALS = [np.array(way) for way in itertools.product((-1.0, 0.0, 1.0), repeat=3) if np.abs(way).sum() == 2]
 
 
 @dataclass
@@ -48,6 +50,7 @@ def find_palm(anatomy: Anatomy, fingers: list[FingerGuess], guesses: Guesses) ->
     middle = palm.mean(axis=0) if len(palm) else _bases(model, fingers).mean(axis=0)
     out = center - middle
     candidates = [("an axis of the root frame", sign * axis) for axis in np.eye(3) for sign in (1, -1)]
+    candidates += [("a diagonal of the root frame", _unit(way)) for way in DIAGONALS]
     candidates += [("an axis of the palm's mesh", way) for way in _mesh_axes(palm)]
     start = tip_positions(model, fingers, _mixed(opened, closed, 0.0))
     later = tip_positions(model, fingers, _mixed(opened, closed, 0.05))
@@ -58,8 +61,12 @@ def find_palm(anatomy: Anatomy, fingers: list[FingerGuess], guesses: Guesses) ->
         candidates.append(("the way in which most fingers begin to close", _unit(np.sum(alike, axis=0))))
     candidates.append(("from the palm's middle to where the tips meet", _unit(out)))
     scores = np.array([_score(points, center, middle, way) for _, way in candidates])
-    best, plain = int(scores.argmax()), int(scores[:6].argmax())
-    chosen = plain if scores[plain] > scores[best] - SNAP else best
+    chosen = best = int(scores.argmax())
+    for simple in (slice(0, 6), slice(6, 18)):  # designers align frames: axes first, then diagonals
+        first = simple.start + int(scores[simple].argmax())
+        if scores[first] > scores[best] - SNAP:
+            chosen = first
+            break
     approach = candidates[chosen][1]
     others = [s for s, (_, way) in zip(scores, candidates, strict=True) if way @ approach < 0.7]
     lead = float(scores[chosen] - max(others, default=0.0))
@@ -144,14 +151,21 @@ def _mesh_axes(palm: np.ndarray) -> list[np.ndarray]:
 
 
 def _score(points: np.ndarray, center: np.ndarray, middle: np.ndarray, way: np.ndarray) -> float:
-    """Return how well an object may come in against `way`: 1.5 where all of the hand is behind it."""
+    """Return how well an object may come in against `way`: 1.5 where all of a beam meets the hand, and only behind.
+
+    A beam of cells; each has hand behind the place where the tips meet, before it, or none.
+    """
     offset = points - center
     along = offset @ way
-    aside = np.linalg.norm(offset - np.outer(along, way), axis=1) < BEAM
-    behind, before = int((aside & (along < 0)).sum()), int((aside & (along > 0.005)).sum())
+    side = np.linalg.svd(way[None])[2][1:]
+    cells = np.round(offset @ side.T / CELL).astype(int)
+    inside = np.linalg.norm(cells * CELL, axis=1) < BEAM
+    reach = int(BEAM / CELL)
+    total = sum(np.hypot(i, j) * CELL < BEAM for i in range(-reach, reach + 1) for j in range(-reach, reach + 1))
+    behind, before = (len(np.unique(cells[inside & half], axis=0)) / total for half in (along < 0, along > 5e-3))
     out = center - middle
     straight = float(out @ way) / max(float(np.linalg.norm(out)), 1e-9)
-    return (behind - 3 * before) / max(behind + before, 100) + 0.5 * straight
+    return float(behind - 2 * before + 0.5 * straight)
 
 
 def _origin(

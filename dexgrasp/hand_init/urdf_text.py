@@ -36,7 +36,7 @@ def _link(link: Link, stem: str, folder: Path) -> ElementTree.Element:
         moments = link.inertia.moments
         keys = {"xx": (0, 0), "xy": (0, 1), "xz": (0, 2), "yy": (1, 1), "yz": (1, 2), "zz": (2, 2)}
         ElementTree.SubElement(inertial, "inertia", {f"i{key}": f"{moments[at]:.6g}" for key, at in keys.items()})
-    bodies = [("visual", f"{stem}.stl", link.visual)] if link.visual is not None and link.visuals else []
+    bodies = [("visual", f"{stem}.stl", link.visual)] if link.visual is not None else []
     bodies += [("collision", f"{stem}_convex_{number}.stl", part) for number, part in enumerate(link.parts)]
     for tag, name, mesh in bodies:
         _export(mesh, folder / name)
