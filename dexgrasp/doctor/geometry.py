@@ -18,6 +18,8 @@ OFF, FAR_OFF = 0.008, 0.02
 """How far collision geometry may be from what is seen, m (90 % of the surface)."""
 FINE = 400
 """Corners of one convex part that make closing slow."""
+LIGHT = 20_000
+"""Faces of a mesh that is looked at; finer ones are simplified."""
 LOOSE, WRONG = 0.002, 0.006
 """How far the fingertip circle may be off the link's surface, m."""
 AWAY = 0.03
@@ -70,7 +72,7 @@ def collision_follows_what_is_seen(hand: Hand) -> Iterator[Finding]:
     fingers = {finger.link for finger in hand.fingers}
     poses = {link: pose[0].numpy() for link, pose in hand.link_poses(closed_by(hand, 0.0)).items()}
     for carrier, links in bodies(hand).items():
-        seen = [hand.visuals[link].copy().apply_transform(poses[link]) for link in links if link in hand.visuals]
+        seen = [_light(hand.visuals[link]).apply_transform(poses[link]) for link in links if link in hand.visuals]
         parts = [part.copy().apply_transform(poses[link]) for link in links for part in hand.collisions.get(link, ())]
         if not seen:
             continue
@@ -156,6 +158,11 @@ def _shapes(hand: Hand) -> Iterator[tuple[str, trimesh.Trimesh]]:
     for link, parts in hand.collisions.items():
         for part in parts:
             yield link, part
+
+
+def _light(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a copy with at most `LIGHT` faces, nearly."""
+    return mesh.copy() if len(mesh.faces) <= LIGHT else mesh.simplify_quadric_decimation(face_count=LIGHT)
 
 
 def _within(meshes: list[trimesh.Trimesh], points: np.ndarray) -> np.ndarray:

@@ -26,14 +26,14 @@ from dexgrasp.seeds import stream
 
 SIZES = (0.02, 0.04, 0.06, 0.08, 0.10)
 """Diameters of balls and edges of cubes, m."""
-CANDIDATES = 1024
+CANDIDATES = 512
 """Hands tried on each, in each of three ways."""
 PARTS = 16
 """Of closing, at which fingertips are an object apart."""
 DEPTH = 0.001
 """Hands may be so deep in the object, m."""
 SELDOM = 0.002
-"""Fewer of the hands than this that hold something are next to none."""
+"""A smaller share of hands that hold something is next to none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +45,13 @@ class Reach:
     """Which fingertips touched it."""
     links: Bool[Tensor, "N F"]
     """Which fingers touched it with whatever part."""
+    opposed: Bool[Tensor, "N"]
+    """Whether two fingertips touched it from different sides: more than 90 deg between the normals."""
 
     @property
     def pairs(self) -> float:
-        """Share of hands that touched it with two fingertips or more."""
-        return float((self.tips.sum(dim=1) >= 2).double().mean()) if len(self.tips) else 0.0
+        """Share of hands that touched it with two fingertips from different sides."""
+        return float(self.opposed.double().mean()) if len(self.opposed) else 0.0
 
     @property
     def most(self) -> int:
@@ -123,7 +125,10 @@ def _reach(hand: Hand, shape: HandShape, closer: Closer, name: str, mesh: trimes
     free = shape.object_distance(field, pose, joints) > -DEPTH
     closure = closer.close(field, pose[free], joints[free])
     clean = (closure.penetration <= DEPTH).unsqueeze(1)
-    return Reach(name, closure.touched & closure.on_tip & clean, closure.touched & clean)
+    tips = closure.touched & closure.on_tip & clean
+    cosines = closure.normals @ closure.normals.transpose(1, 2)  # NaN where a finger touches nothing
+    opposed = ((cosines < 0) & tips.unsqueeze(1) & tips.unsqueeze(2)).any(dim=2).any(dim=1)
+    return Reach(name, tips, closure.touched & clean, opposed)
 
 
 def _between(hand: Hand) -> tuple[Float[Tensor, "N 4 4"], Float[Tensor, "N J"]]:
