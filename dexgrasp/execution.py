@@ -31,10 +31,14 @@ def opened(hand: Hand, joints: Float[Tensor, "N J"], most: float = math.inf) -> 
 
     Or until it has opened by `most` (times its rates, rad or m). Closing from there leads through `joints` again.
     """
-    result = joints.clone()
+    result, done = joints.clone(), set[str]()
     for finger in hand.fingers:
-        places = hand.joint_index(tuple(finger.closing))
-        rates = torch.tensor(list(finger.closing.values()), dtype=joints.dtype, device=joints.device)
+        own = {joint: rate for joint, rate in finger.closing.items() if joint not in done}
+        done |= set(own)
+        if not own:
+            continue
+        places = hand.joint_index(tuple(own))
+        rates = torch.tensor(list(own.values()), dtype=joints.dtype, device=joints.device)
         low, high = hand.limits[places].T.to(joints)
         way = ((result[:, places] - torch.where(rates > 0, low, high)) / rates).min(dim=1, keepdim=True).values
         result[:, places] = result[:, places] - way.clamp(max=most) * rates
