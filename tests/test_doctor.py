@@ -198,15 +198,11 @@ def test_what_is_wrong_with_a_hand_is_told(barrett, check, severity, spoil):
     assert not [f for f in check(barrett) if f.severity is not Severity.NOTE]
 
 
-def test_a_mirrored_hand_is_told(barrett):
-    """Finger 3 stands opposite: named thumb, and moved beside the others, the hand has a side."""
-    names = ("index", "ring", "thumb")
-    fingers = tuple(dataclasses.replace(f, name=name) for f, name in zip(barrett.fingers, names, strict=True))
-    frame = torch.eye(4, dtype=torch.float64)
-    frame[:3, :3] = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]], dtype=torch.float64)
-    hand = changed(barrett, name="hand_right", fingers=fingers, base_T_palm=frame)
-    told = {side: list(motion.a_hand_is_its_own_side(changed(hand, name=f"hand_{side}"))) for side in ("left", "right")}
-    assert len(told["left"]) + len(told["right"]) <= 1
+def test_a_hand_of_the_other_side_is_told():
+    right = load_hand("allegro_right")
+    assert list(motion.a_hand_is_its_own_side(right)) == []
+    (finding,) = motion.a_hand_is_its_own_side(changed(right, name="allegro_left"))
+    assert "those of a right hand" in finding.seen and finding.severity is Severity.WARNING
 
 
 def test_fingertips_that_reach_nothing_are_told(barrett, monkeypatch):
