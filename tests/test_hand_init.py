@@ -255,6 +255,34 @@ def test_an_mjcf_file(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("limit", "kind"),
+    [
+        ('<limit lower="-100" upper="100" effort="99999" velocity="1"/>', "revolute"),
+        ('<limit lower="1.2" upper="0" effort="1" velocity="1"/>', "revolute"),
+        ('<limit lower="0" upper="0" effort="0" velocity="0"/>', "revolute"),
+    ],
+)
+def test_limits_that_are_none_are_replaced(tmp_path, limit, kind):
+    written, hand = made(write(tmp_path, PALM, *claw(limit=limit, kind=kind)), tmp_path)
+    np.testing.assert_allclose(hand.limits, [[0, 1.2]] * 3, atol=0.1)
+    assert "limits" in {guess.topic for guess in written.guesses.unsure}
+
+
+def test_jaws_without_limits_that_are_closed_at_zero(tmp_path):
+    _, hand = made(write(tmp_path, PALM, *jaws(limit="")), tmp_path)
+    np.testing.assert_allclose(hand.limits, [[-0.001, 0.04]], atol=1e-6)
+    assert hand.fingers[0].closing == {"palm_left": -1.0}
+
+
+def test_a_palm_without_shape_on_a_floating_base(tmp_path):
+    parts = [link("odometry", ""), link("palm", ""), joint("float", "odometry", "palm", kind="floating", limit="")]
+    written, hand = made(write(tmp_path, *parts, *claw()), tmp_path)
+    assert hand.link_names[0] == "palm"
+    np.testing.assert_allclose(approach(hand), [0, 0, 1], atol=1e-6)
+    assert "palm" in {guess.topic for guess in written.guesses.unsure}
+
+
+@pytest.mark.parametrize(
     ("parts", "expected"),
     [
         ([PALM], "two fingers or more"),

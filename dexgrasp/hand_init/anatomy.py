@@ -38,7 +38,7 @@ def rigid(model: Model, link: str) -> list[str]:
     """Return a link and the links fixed below it."""
     group = [link]
     for name in group:
-        group += [joint.child for joint in model.joints.values() if joint.parent == name and not joint.moves]
+        group += [joint.child for joint in model.joints.values() if joint.parent == name and joint.kind == "fixed"]
     return group
 
 
@@ -51,7 +51,9 @@ def find_hand(model: Model, root: str | None, guesses: Guesses) -> Anatomy:
         if root not in model.links:
             raise DexgraspError(f"a link of {model.path} as root", repr(root), f"one of {', '.join(model.links)}")
         model = model.cut(root)
-    groups = {name: rigid(model, name) for name in model.order if name not in model.above or model.above[name].moves}
+    groups = {
+        name: rigid(model, name) for name in model.order if name not in model.above or model.above[name].kind != "fixed"
+    }
     below = {name: [n for n in groups if n in set(model.below(name)) and n != name] for name in groups}
     tips = {name: _tips(model, groups, below, name) for name in groups}
     branching = [name for name in groups if len(_branches(model, groups, tips, name)) > 1]

@@ -4,12 +4,12 @@ import numpy as np
 import trimesh
 
 from dexgrasp.hand_init.anatomy import Anatomy
-from dexgrasp.hand_init.fingers import FingerGuess, middle, tip_positions
+from dexgrasp.hand_init.fingers import WIDEST, FingerGuess, group_mesh, middle, tip_positions
 from dexgrasp.hand_init.guess import Guesses
 from dexgrasp.hand_init.model import Inertia, Joint, Model
 
-WIDEST = {"revolute": 4.2, "prismatic": 0.3}
-"""No finger joint moves farther, rad or m: a range beyond stands for none."""
+OPEN = 0.04
+"""A jaw without limits that is closed at zero opens so far, m."""
 BEND = 1.2
 """A finger's joint without limits bends at least this far, rad."""
 TIP_FORCE = 15.0
@@ -143,8 +143,16 @@ def _hull(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
 
 
 def _closing_range(model: Model, fingers: list[FingerGuess], joint: Joint, rate: float) -> tuple[float, float]:
-    """Return lower and upper end between which a joint without limits closes, the others at 0 or in their middle."""
-    width = np.pi / 2 if joint.kind == "revolute" else 0.06
+    """Return lower and upper end between which a joint without limits closes, the others in their middle.
+
+    Zero is taken to be open, as usual, unless the tips are together there.
+    """
+    if joint.kind == "prismatic":
+        gap = _gap(model, fingers, joint, rate)
+        ends = (0.0, gap / 2) if gap > 0.004 else (-OPEN, max(gap, 0.0) / 2)
+        low, high = sorted((rate * ends[0], rate * ends[1]))
+        return round(low, 4), round(high, 4)
+    width = np.pi / 2
     values = np.linspace(-width, width, 61)
     rest = {name: np.repeat(value, 61) for name, value in middle(model).items()}
     tips = tip_positions(model, fingers, {**rest, joint.name: rate * values})
@@ -152,13 +160,26 @@ def _closing_range(model: Model, fingers: list[FingerGuess], joint: Joint, rate:
     others = [i for i in range(len(fingers)) if i not in own] or own
     apart = np.linalg.norm(tips[:, own, None] - tips[:, None, others], axis=-1).mean(axis=(1, 2))
     nearest = float(values[apart.argmin()])
-    small = 0.15 if joint.kind == "revolute" else 0.004
-    # Zero is open, as usual, unless the tips are together there.
-    # A finger may bend beyond, round an object.
-    start, stop = (0.0, nearest) if nearest > small else (-0.6 * width, max(nearest, 0.0))
-    stop = max(stop, BEND) if joint.kind == "revolute" and start == 0 else stop
-    ends = sorted((rate * start, rate * stop))
-    return round(ends[0], 4), round(ends[1], 4)
+    # A finger may bend beyond the place where tips meet, round an object.
+    start, stop = (0.0, max(nearest, BEND)) if nearest > 0.15 else (-0.6 * width, max(nearest, 0.0))
+    low, high = sorted((rate * start, rate * stop))
+    return round(low, 4), round(high, 4)
+
+
+def _gap(model: Model, fingers: list[FingerGuess], joint: Joint, rate: float) -> float:
+    """Return how far jaws are apart along a slide at zero, m."""
+    poses = model.poses({})
+    fronts: list[list[float]] = [[], []]
+    way = poses[joint.child][0, :3, :3] @ joint.axis * rate
+    moved = set(model.below(joint.child))
+    for finger in fingers:
+        mesh = group_mesh(model, finger.chain)
+        if mesh is not None:
+            pose = poses[finger.last.child][0]
+            along = (mesh.vertices @ pose[:3, :3].T + pose[:3, 3]) @ way
+            other = finger.last.child not in moved
+            fronts[other].append(float(along.min() if other else along.max()))
+    return min(fronts[1]) - max(fronts[0]) if all(fronts) else 0.0
 
 
 def _lever(

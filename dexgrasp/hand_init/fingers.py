@@ -16,6 +16,8 @@ from dexgrasp.hand_init.model import Joint, Model
 
 FINGER_WORDS = ("thumb", "index", "middle", "ring", "little", "pinky", "pinkie")
 SHORT_WORDS = {"th": "thumb", "ff": "index", "mf": "middle", "rf": "ring", "lf": "little", "if": "index"}
+WIDEST = {"revolute": 4.2, "prismatic": 0.3}
+"""No finger joint moves farther, rad or m: a range beyond stands for none."""
 FOLLOWED = 0.012
 """A link that stays this near to a longer finger's links is a part of its linkage, m."""
 
@@ -74,8 +76,7 @@ def tip_positions(
 
 def span(joint: Joint) -> tuple[float, float]:
     """Return the range of a joint, or what is tried where it has none."""
-    known = np.isfinite([joint.lower, joint.upper]).all()
-    if known:
+    if joint.upper - joint.lower < WIDEST[joint.kind]:
         return joint.lower, joint.upper
     return (-0.05, 0.05) if joint.kind == "prismatic" else (-np.pi / 2, np.pi / 2)
 

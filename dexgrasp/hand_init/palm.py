@@ -60,7 +60,9 @@ def find_palm(anatomy: Anatomy, fingers: list[FingerGuess], guesses: Guesses) ->
     if len(alike) > len(fingers) / 2:
         candidates.append(("the way in which most fingers begin to close", _unit(np.sum(alike, axis=0))))
     candidates.append(("from the palm's middle to where the tips meet", _unit(out)))
-    scores = np.array([_score(points, center, middle, way) for _, way in candidates])
+    # Without a palm there is nothing behind by which directions could be told apart.
+    seen = points if len(palm) else np.zeros((0, 3))
+    scores = np.array([_score(seen, center, middle, way) for _, way in candidates])
     chosen = best = int(scores.argmax())
     for simple in (slice(0, 6), slice(6, 18)):  # designers align frames: axes first, then diagonals
         first = simple.start + int(scores[simple].argmax())
