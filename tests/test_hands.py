@@ -105,8 +105,8 @@ def test_closing_from_the_opened_posture_leads_back(hand):
 
 
 def test_hands_find_grasps_that_lift(hand):
-    item = block(0.045, 0.05, 0.12)
-    settings = SynthesisSettings(rounds=6, batch=4096, target=30)
+    item = block(0.073, 0.048, 0.131)
+    settings = SynthesisSettings(rounds=5, batch=8192, target=40)
     grasps, summary = synthesize(hand, item, settings, 0)
     assert len(grasps) >= 5, summary
     assert grasps.quality.min() >= settings.epsilon and not grasps.contacts.isnan().any()
