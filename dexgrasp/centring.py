@@ -12,6 +12,7 @@ import torch
 
 from dexgrasp.closing import CLOSED, close_fingers
 from dexgrasp.distance import Field
+from dexgrasp.hand import Hand
 from dexgrasp.hand_body import HandBody, hand_body
 from dexgrasp.urdf import UrdfHand
 
@@ -29,8 +30,10 @@ Closed = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.nd
 class Centring:
     """Closes hands like `close_fingers`, but so that fingers which share a closing joint touch together."""
 
-    def __init__(self, hand: UrdfHand) -> None:
-        self.hand, self.body = hand, hand_body(hand)
+    def __init__(self, hand: Hand) -> None:
+        self.body = hand_body(hand)
+        assert isinstance(hand, UrdfHand)  # as `hand_body` makes sure
+        self.hand = hand
         self.groups = shared_fingers(self.body.rates)
         self.apart, self.sources = _apart(self.body, self.groups) if self.groups else (self.body, np.zeros(0, int))
 

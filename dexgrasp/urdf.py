@@ -156,8 +156,8 @@ class UrdfHand(Hand):
         geometry = self._tip(given, path, sign)
         if "closing_axis" not in given and joints[-1].kind == "revolute":
             # Of a linkage the last joint may turn back while the finger closes: what counts is where the tip goes.
-            moved = self._travel(link, geometry[1], rates) @ np.cross(geometry[3], geometry[2] - geometry[1])
-            geometry = (*geometry[:3], -geometry[3] if moved > 0 else geometry[3])
+            opposed = self._travel(link, geometry[1], rates) @ np.cross(geometry[3], geometry[2] - geometry[1])
+            geometry = (*geometry[:3], -geometry[3] if opposed > 0 else geometry[3])
         return Finger(
             name=str(given.get("name", link)),
             link=link,
