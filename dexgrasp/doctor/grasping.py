@@ -32,7 +32,7 @@ PARTS = 16
 """Of closing, at which fingertips are an object apart."""
 DEPTH = 0.001
 """Hands may be so deep in the object, m."""
-SELDOM = 0.002
+SELDOM = 0.01
 """A smaller share of hands that hold something is next to none."""
 
 

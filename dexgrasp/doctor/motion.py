@@ -34,7 +34,7 @@ def links_are_apart_when_open(hand: Hand) -> Iterator[Finding]:
         both_tips = {found.first, found.second} <= tips
         tell = error if both_tips else warning if found.depth > DEEP and not found.above else note
         yield tell(
-            f"{found.first}, {found.second}",
+            f"{found.first} and {found.second}",
             f"overlap by {found.depth * 1e3:.1f} mm with the fingers open",
             "pairs that overlap at rest are taken for a joint's cover: their collisions are never tested"
             + ("; two fingertips in each other can hold nothing" if both_tips else ""),
