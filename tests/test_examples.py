@@ -26,4 +26,4 @@ def test_an_example_installs_and_conforms(example, tmp_path):
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--import-mode=importlib", "tests"]
     done = subprocess.run(command, cwd=example, env=environment, capture_output=True, text=True, timeout=250)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-1000:]
-    assert " passed" in done.stdout and "failed" not in done.stdout
+    assert "....." in done.stdout, "five laws or more were tried"
