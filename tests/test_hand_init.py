@@ -96,6 +96,9 @@ def test_a_parallel_jaw(tmp_path):
     assert {finger.link for finger in hand.fingers} == {"left_jaw", "right_jaw"}
     np.testing.assert_allclose(approach(hand), [0, 0, 1], atol=1e-6)
     assert hand.base_T_palm[2, 3] == pytest.approx(0.02, abs=2e-3)
+    for finger in hand.fingers:  # the circle touches the flat pad
+        assert abs(float(finger.tip_center[0])) - finger.tip_radius == pytest.approx(0.0, abs=1e-4)
+        assert float(finger.tip_center[2]) == pytest.approx(0.05, abs=1e-3)
     assert written.folder.joinpath("pyproject.toml").is_file() and written.folder.joinpath("README.md").is_file()
 
 

@@ -3,15 +3,26 @@
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 from jaxtyping import Float
 from numpy import ndarray
+from scipy.spatial import ConvexHull, QhullError
 
+from dexgrasp.ball_tree import planes
 from dexgrasp.errors import DexgraspError
 from dexgrasp.fingertip import fit_fingertip
 from dexgrasp.hand_init.fingers import FingerGuess, middle
 from dexgrasp.hand_init.guess import Guesses
 from dexgrasp.hand_init.model import Model
 
+FLAT, FACING, TOUCHING = 0.012, 0.8, 6e-4
+"""A pad is flat where a side of the outline is so long (m) and faces the closing direction; a circle touches it, m."""
+BESIDE = 0.006
+"""A round tip that goes over into a flat side touches that at its end, or so far beside it, m."""
+NEAR = 0.015
+"""The pad begins this near to where the fitted circle would touch, m."""
+PAD = 0.008
+"""Largest circle in a flat pad, and how far from its end it touches, m."""
 REACH = 0.03
 """Distance from the tip's centre to the virtual outer joint of a slide, m (METHOD section 1)."""
 
@@ -64,6 +75,12 @@ def find_fingertip(model: Model, finger: FingerGuess, approach: np.ndarray, gues
     except DexgraspError:
         center, radius, told = tip - 0.008 * _unit(tip - origin), 0.008, ("tip_radius", "tip_center", *told)
         guesses.add(topic, "no circle could be fitted: 8 mm at the end of the mesh was taken; look at it", "UNSURE")
+    pad = np.cross(axis, _unit(center - origin)) if distal is None else direction
+    flat = _on_pad(model.links[finger.link].parts, center, radius, axis, pad)
+    if flat is not None:
+        (center, radius), told = flat, ("tip_radius", "tip_center", *told)
+        text = f"the pad is flat: a circle of {radius * 1e3:.1f} mm that touches it near its end"
+        guesses.add(topic, text, "likely")
     plane = origin + ((center - origin) @ axis) * axis
     if abs((plane - origin) @ axis) > 1e-6:
         aside = abs((plane - origin) @ axis) * 1e3
@@ -71,6 +88,51 @@ def find_fingertip(model: Model, finger: FingerGuess, approach: np.ndarray, gues
     outer = center - REACH * _unit(direction + distal) if distal is not None else plane
     _judge(mesh, plane, center, radius, axis, outer, topic, guesses)
     return Fingertip(radius, center, axis, outer, told)
+
+
+def _on_pad(
+    parts: tuple[trimesh.Trimesh, ...], center: np.ndarray, radius: float, axis: np.ndarray, pad: np.ndarray
+) -> tuple[np.ndarray, float] | None:
+    """Return a circle that touches the flat pad of what collides; None without one, or where the given circle does."""
+    across = _unit(pad - (pad @ axis) * axis)
+    along = np.cross(across, axis)
+    # The part that holds the circle's middle: a hull over several would have sides that nothing has.
+    depths = [float((side[:, :3] @ center - side[:, 3]).max()) for side in map(planes, parts)]
+    parts = parts[int(np.argmin(depths)) :][:1] if depths else ()
+    cuts = [trimesh.intersections.mesh_plane(part, axis, center + 1e-7 * axis).reshape(-1, 3) for part in parts]
+    points = np.vstack([np.zeros((0, 3)), *cuts]) - center
+    if len(points) < 4:
+        return None
+    try:
+        outline = (points @ np.stack([along, across], axis=1))[
+            ConvexHull(points @ np.stack([along, across], axis=1)).vertices
+        ]
+    except QhullError:
+        return None
+    ends = np.roll(outline, -1, axis=0)  # counter-clockwise: the outside is on the right
+    sides = ends - outline
+    length = np.linalg.norm(sides, axis=1)
+    outwards = np.stack([sides[:, 1], -sides[:, 0]], axis=1) / np.maximum(length, 1e-9)[:, None]
+    facing = (outwards[:, 1] > FACING) & (length > FLAT)
+    if not facing.any():
+        return None
+    side = int(np.where(facing, length, 0.0).argmax())
+    normal, start, stop = outwards[side], outline[side], ends[side]
+    low, high = sorted((start[0], stop[0]))
+    if abs(start @ normal - radius) < TOUCHING and low - BESIDE < radius * normal[0] < high + BESIDE:
+        return None
+    # The end of the pad is that which is nearer to the fitted circle, which is at the finger's end.
+    if np.linalg.norm(start - radius * normal) < np.linalg.norm(stop - radius * normal):
+        start, stop = stop, start
+    if np.linalg.norm(stop - radius * normal) > NEAR:
+        return None  # farther up the finger
+    way = (start - stop) / length[side]
+    thick = float(np.ptp(outline @ normal))
+    if radius > 0.93 * thick / 2:
+        return None  # a round tip: its circle is as thick as the finger
+    new = min(PAD, thick / 2)
+    middle = stop + min(PAD, length[side] / 2) * way - new * normal
+    return center + middle[0] * along + middle[1] * across, new
 
 
 def _velocity(model: Model, finger: FingerGuess, tip: np.ndarray) -> np.ndarray:
@@ -87,8 +149,6 @@ def _judge(
     guesses: Guesses,
 ) -> None:  # fmt: skip
     """Note how far the link's outline, where it touches, is from the circle: -30 to 90 deg from its end."""
-    import trimesh
-
     assert isinstance(mesh, trimesh.Trimesh)
     u = _unit(outer - center)
     pad = -np.cross(axis, u)

@@ -69,8 +69,8 @@ def init_hand(
     shared = find_closing(anatomy, fingers, guesses)
     complete_ranges(anatomy, fingers, guesses)
     palm = find_palm(anatomy, fingers, guesses)
-    tips = [find_fingertip(model, finger, palm.approach, guesses) for finger in fingers]
     fits = make_parts(model, fingers, guesses)
+    tips = [find_fingertip(model, finger, palm.approach, guesses) for finger in fingers]
     complete_efforts(model, fingers, guesses)
     complete_inertias(model, guesses)
     allowed = find_allowed(model, guesses)
