@@ -18,7 +18,7 @@ PIPELINES = {
 
 TOOLS = {
     "plugins": "list installed hands, representations and backbones",
-    "hand": "try the laws on a hand: hand check <name>",
+    "hand": "hand check <name>: look a hand over; hand init <file>: write one from a URDF",
     "report": "write the report of an evaluation again: report <folder>",
 }
 """Ordinary arguments."""

@@ -16,7 +16,7 @@ from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.framing import Framing
 from dexgrasp.dataset.sensor import Sensor, capture
 from dexgrasp.evaluation import Episode, Policy, attempt_rows, ceilings, clear, rate, summarise
-from dexgrasp.execution import pregrasp
+from dexgrasp.execution import opened
 from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
 from dexgrasp.model import GraspNet, load_model
@@ -30,6 +30,7 @@ from dexgrasp.settings import read
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.statistics import bootstrap_ratio
+from dexgrasp.wrench_model import torsion_of
 
 
 @dataclass(frozen=True)
@@ -89,12 +90,12 @@ class Campaign:
     def reached(self, item: Object, pose: Float[Tensor, "4 4"], grasp: Grasps) -> float:
         """Return epsilon of the contacts in which the fingers end on the true mesh, torque about its centre of mass."""
         dataset, synthesis = self.dataset, self.dataset.config["synthesis"]
-        _, opened = pregrasp(dataset.hand, grasp, opening=self.protocol.motion.opening)
+        start = opened(dataset.hand, grasp.joints.double(), self.protocol.motion.opening)
         base = inverse(pose.double()) @ grasp.pose.double()
-        closure = dataset.closer.close(dataset.field(dataset.objects.names.index(item.name)), base, opened.double())
-        cones = wrenches(
-            closure.contacts, closure.normals, item.com, item.radius, synthesis["friction"], synthesis["edges"]
-        )
+        closure = dataset.closer.close(dataset.field(dataset.objects.names.index(item.name)), base, start, centred=True)
+        torsion = torsion_of(len(dataset.hand.fingers), synthesis.get("torsion"))
+        about = (item.com, item.radius, synthesis["friction"], synthesis["edges"], torsion)
+        cones = wrenches(closure.contacts, closure.normals, *about)
         return float(epsilon(cones)[0])
 
 

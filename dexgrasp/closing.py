@@ -58,13 +58,22 @@ class Closer:
         pose: Float[Tensor, "N 4 4"],
         joints: Float[Tensor, "N J"],
         breakaway: bool = False,
+        centred: bool = False,
     ) -> Closure:
         """Close hands at object_T_base `pose` (m) from the posture `joints`.
 
         With `breakaway`, links beyond one that touches go on until they touch themselves (BarrettHand's clutch).
+        With `centred`, hands are first moved so that fingers which share a closing joint touch together; those that
+        cannot touch with no tip.
         """
         base, start = as_arrays(pose, joints)
-        _, full, touches, on_tip, depth = close_fingers(self.body, field.field, base, start, breakaway, False, np.inf)
+        if centred and not breakaway:
+            from dexgrasp.centring import Centring  # it closes with `close_fingers`
+
+            _, _, full, touches, on_tip, depth = Centring(self.hand).close(field.field, base, start)
+        else:
+            found = close_fingers(self.body, field.field, base, start, breakaway, False, np.inf)
+            _, full, touches, on_tip, depth = found
         touches_t = torch.from_numpy(touches).to(pose)
         return Closure(
             joints=torch.from_numpy(full[:, self.body.leaders]).to(joints),

@@ -70,11 +70,14 @@ class HandShape:
 
     @property
     def pairs(self) -> np.ndarray:
-        """(Q, 2) links that may collide: not neighbours, and apart in the open posture."""
+        """(Q, 2) links that may collide: not neighbours, not allowed to, and apart in the open posture."""
         if self._pairs is None:
             body = self.body
             solid = [link for link in range(len(body.parents)) if body.roots[link] >= 0]
             every = [(a, b) for a in solid for b in solid if a < b and body.parents[b] != a and body.parents[a] != b]
+            names = [record.name for record in self.hand.tree]  # type: ignore[attr-defined]
+            allowed = {frozenset(pair) for pair in getattr(self.hand, "allowed_contacts", ())}
+            every = [(a, b) for a, b in every if frozenset((names[a], names[b])) not in allowed]
             pairs = np.array(every, dtype=np.int64).reshape(-1, 2)
             closed = body.rates.sum(axis=0)
             low, high = body.joint_limits.T

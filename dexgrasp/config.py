@@ -1,4 +1,4 @@
-"""Hydra as the command line uses it: search path, the resolver `${package:...}`, one wrapper round every task."""
+"""Hydra as the command line uses it: search path, our resolvers (`package`, `data`), one wrapper round every task."""
 
 import itertools
 import logging
@@ -30,8 +30,17 @@ def package(name: str) -> str:
     return str(folder)
 
 
+def data(name: str, path: str) -> str:
+    """Resolve `${data:distribution,path}`: a data file of an installed distribution, by the end of its path."""
+    found = registry.installed_file(name, path)
+    if found is None:
+        raise DexgraspError(f"a file {path!r} in the installed distribution {name!r}", "none", f"pip install {name}")
+    return str(found)
+
+
 # At import, so that it is there in every worker process that unpickles a task or a config.
 OmegaConf.register_new_resolver("package", package, replace=True)
+OmegaConf.register_new_resolver("data", data, replace=True)
 OmegaConf.register_new_resolver("first", lambda *values: next((v for v in values if v is not None), None), replace=True)
 
 

@@ -48,7 +48,7 @@ def convex_parts(mesh: trimesh.Trimesh, threshold: float = 0.005) -> tuple[trime
 
 def _decompose(mesh: trimesh.Trimesh, threshold: float) -> list[Array]:
     hull = mesh.convex_hull
-    if mesh.volume > 0.97 * hull.volume:
+    if mesh.is_watertight and mesh.volume > 0.97 * hull.volume:
         return [_at_most_64(np.asarray(hull.vertices))]
     import coacd  # loads a large library: only when a mesh is not in the cache
 

@@ -26,6 +26,25 @@ def pregrasp(
     return pose, hand.clamp(grasps.joints - opening * closing_direction(hand).to(grasps.joints))
 
 
+def opened(hand: Hand, joints: Float[Tensor, "N J"], most: float = math.inf) -> Float[Tensor, "N J"]:
+    """Return postures with every finger opened: back along its closing motion until a joint is at its limit.
+
+    Or until it has opened by `most` (times its rates, rad or m). Closing from there leads through `joints` again.
+    """
+    result, done = joints.clone(), set[str]()
+    for finger in hand.fingers:
+        own = {joint: rate for joint, rate in finger.closing.items() if joint not in done}
+        done |= set(own)
+        if not own:
+            continue
+        places = hand.joint_index(tuple(own))
+        rates = torch.tensor(list(own.values()), dtype=joints.dtype, device=joints.device)
+        low, high = hand.limits[places].T.to(joints)
+        way = ((result[:, places] - torch.where(rates > 0, low, high)) / rates).min(dim=1, keepdim=True).values
+        result[:, places] = result[:, places] - way.clamp(max=most) * rates
+    return result
+
+
 def closing_direction(hand: Hand) -> Float[Tensor, "J"]:
     """Return, per independent joint, +1 or -1 where moving that way closes fingers, 0 where it closes none."""
     direction = torch.zeros(len(hand.joint_names), dtype=torch.float64)

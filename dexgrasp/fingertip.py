@@ -10,6 +10,10 @@ from dexgrasp.errors import DexgraspError
 
 RESIDUAL = 0.004
 """Largest distance of an outline vertex from the circle, relative to its radius."""
+ASIDE = 0.002
+"""A tip whose middle lies farther than this off the joint's plane is cut through its own middle, m."""
+END = 0.2
+"""The tip's middle is that of this part of the link's length."""
 LARGEST_STEP = np.radians(40.0)
 """Neighbouring outline vertices farther apart than this on the circle are a flat, not an arc."""
 SHORTEST_ARC = np.radians(40.0)
@@ -20,11 +24,14 @@ def fit_fingertip(
 ) -> tuple[Float[ndarray, "3"], float]:
     """Return centre (m) and radius (m) of the circle that ends a finger's side view.
 
-    The outline is the convex hull of the mesh's section by the plane through `origin` with normal `axis`. Of all its
+    The outline is the convex hull of the mesh's section by the plane through `origin` with normal `axis`, or, where the
+    tip lies aside of that by more than `ASIDE`, by the parallel plane through the tip's middle. Of all its
     stretches beyond the middle of the finger that are circle arcs, the longest wins. A tip without an arc (a box)
     gets the largest circle that fits its end. `distal` points from the joint to the tip; None finds it.
     """
     first, second = _plane_axes(axis)
+    aside = _aside(mesh, origin, axis, distal)
+    origin = origin + (aside if abs(aside) > ASIDE else 0.0) * axis
     outline = _outline(mesh, origin, axis, first, second)
     if distal is None:
         towards = outline[np.argmax(np.linalg.norm(outline, axis=1))]
@@ -36,6 +43,17 @@ def fit_fingertip(
     circle = _longest_arc(end, np.ptp(end @ np.array([-towards[1], towards[0]])))
     center, radius = circle if circle is not None else _inscribed(end, towards)
     return origin + center[0] * first + center[1] * second, radius
+
+
+def _aside(mesh: trimesh.Trimesh, origin: ndarray, axis: ndarray, distal: ndarray | None) -> float:
+    """Return how far along `axis` the middle of the link's end lies."""
+    corners = mesh.vertices - origin
+    across = corners @ axis
+    flat = corners - across[:, None] * axis
+    towards = flat[np.argmax(np.linalg.norm(flat, axis=1))] if distal is None else distal
+    along = flat @ towards / np.linalg.norm(towards)
+    end = across[along >= along.max() - END * np.ptp(along)]
+    return float((end.min() + end.max()) / 2)
 
 
 def _plane_axes(axis: ndarray) -> tuple[ndarray, ndarray]:

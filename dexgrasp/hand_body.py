@@ -85,7 +85,10 @@ def hand_body(hand: Hand, coarseness: float = 1.0) -> HandBody:
 def _compile(hand: UrdfHand, coarseness: float) -> HandBody:
     names = [record.name for record in hand.tree]
     matrix, offset = (part.numpy() for part in hand.coupling)
-    limits = np.stack([hand.model.lowerPositionLimit, hand.model.upperPositionLimit], axis=1)
+    # Coupled joints go where their drivers take them, and to their own limits after breakaway.
+    ends = np.sort(hand.full_joints(hand.limits.T).numpy().T, axis=1)
+    own = np.stack([hand.model.lowerPositionLimit, hand.model.upperPositionLimit], axis=1)
+    limits = np.stack([np.minimum(ends[:, 0], own[:, 0]), np.maximum(ends[:, 1], own[:, 1])], axis=1)
     rates = np.array([[finger.closing.get(joint, 0.0) for joint in hand.joint_names] for finger in hand.fingers])
     balls, children, roots, links = [], [], np.full(len(names), -1), []
     count = 0

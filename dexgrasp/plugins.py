@@ -25,6 +25,7 @@ __all__ = [
     "build_hand",
     "build_representation",
     "conf_folders",
+    "hand_options",
     "installed",
     "load_backbone",
     "load_class",
@@ -41,6 +42,11 @@ def load_hand(name: str, **overrides: Any) -> "Hand":
     `overrides` replace keys of its YAML. Raises `DexgraspError` for an unknown or broken hand.
     """
     return build_hand(_options("hand", name, overrides))
+
+
+def hand_options(name: str) -> dict[str, Any]:
+    """Return what the YAML of a hand says, by name or path, every `${...}` replaced; nothing is loaded."""
+    return _resolved("hand", _options("hand", name, {}))
 
 
 def load_representation(name: str, hand: "Hand", channels: int = 128, **options: Any) -> "Representation":

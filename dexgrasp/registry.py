@@ -4,7 +4,7 @@ import ast
 import difflib
 import inspect
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -116,6 +116,17 @@ def package_folder(package: str) -> Path | None:
         if folder.is_dir():
             return folder.resolve()
     return None
+
+
+def installed_file(name: str, path: str) -> Path | None:
+    """Return the file of an installed distribution whose path ends with `path`; None where there is none."""
+    try:
+        listed = distribution(name).files or []
+    except PackageNotFoundError:
+        return None
+    wanted = Path(path).parts
+    found = next((file for file in listed if file.parts[-len(wanted) :] == wanted), None)
+    return Path(str(found.locate())).resolve() if found else None
 
 
 def entries(kind: str) -> list[EntryPoint]:

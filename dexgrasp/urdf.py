@@ -16,7 +16,7 @@ from dexgrasp.fingertip import fit_fingertip
 from dexgrasp.hand import Finger, Hand
 from dexgrasp.kinematics import KinematicTree, LinkRecord
 from dexgrasp.urdf_file import UrdfFile
-from dexgrasp.urdf_geometry import convex, joined, link_meshes
+from dexgrasp.urdf_geometry import convex_pieces, joined, link_meshes
 
 VIRTUAL_REACH = 0.03
 """Distance from fingertip centre to the virtual outer joint of a prismatic finger, m."""
@@ -40,6 +40,13 @@ class UrdfHand(Hand):
         shared: independent joints that are main joints of every finger.
         root: link at which the hand begins, where the URDF holds a whole arm; the base frame is its frame.
         palm: a link whose frame is the palm frame, or {origin, approach} in the base frame.
+        couplings: {joint: {joint, multiplier (1), offset (0)}}, in place of `<mimic>` tags that are wrong or missing;
+            null frees a joint.
+        limits: {joint: [lower, upper]}, rad or m, in place of the URDF's.
+        efforts: {joint: N m or N}, in place of the URDF's, which often are not the real ones.
+        allowed_contacts: pairs of links that may overlap, besides neighbours and what does so in the open posture.
+        collision: `given` (the URDF's `<collision>`) or `visual`; default: `given`, where the URDF has none at all
+            `visual`. What is not convex is cut into convex parts (see `convex_pieces`).
         model: nothing but a key that the YAML's `urdf` may be composed from, where a hand comes in several models.
 
     Raises:
@@ -55,10 +62,17 @@ class UrdfHand(Hand):
         shared: Sequence[str] = (),
         root: str | None = None,
         palm: str | Mapping[str, Sequence[float]] | None = None,
+        couplings: Mapping[str, Mapping[str, Any] | None] | None = None,
+        limits: Mapping[str, Sequence[float]] | None = None,
+        efforts: Mapping[str, float] | None = None,
+        allowed_contacts: Sequence[Sequence[str]] = (),
+        collision: str | None = None,
         model: str | None = None,
     ) -> None:
         self.name, self.urdf = name, Path(urdf)
-        file = UrdfFile(self.urdf, root)
+        self.couplings = dict(couplings or {})
+        """What replaces `<mimic>` tags of the URDF."""
+        file = UrdfFile(self.urdf, root, couplings, limits, efforts)
         self.model = file.model()
         self.kinematics = KinematicTree(self.model)
         self.tree: tuple[LinkRecord, ...] = self.kinematics.records
@@ -71,8 +85,15 @@ class UrdfHand(Hand):
         self.masses = file.masses()
         visuals = link_meshes(file.robot, "visual", self.urdf)
         self.visuals = {link: joined(meshes) for link, meshes in visuals.items()}
-        collisions = link_meshes(file.robot, "collision", self.urdf)
-        self.collisions = {link: tuple(convex(mesh, link) for mesh in meshes) for link, meshes in collisions.items()}
+        self._known([] if collision is None else [collision], ("given", "visual"), "source of collision geometry")
+        solids = {} if collision == "visual" else link_meshes(file.robot, "collision", self.urdf)
+        solids = visuals if collision == "visual" or not (solids or collision) else solids
+        self.collisions = {
+            link: tuple(part for mesh in meshes for part in convex_pieces(mesh, link))
+            for link, meshes in solids.items()
+        }
+        self._known([link for pair in allowed_contacts for link in pair], self.link_names, "link")
+        self.allowed_contacts = tuple((str(first), str(second)) for first, second in allowed_contacts)
         self._known(shared, self.joint_names, "shared joint")
         self.shared = tuple(joint for joint in self.joint_names if joint in shared)
         self.base_T_palm = self._palm(palm)
@@ -133,6 +154,10 @@ class UrdfHand(Hand):
         rates = torch.tensor([closing.get(joint, 0.0) for joint in self.joint_names], dtype=torch.float64)
         sign = -1.0 if float(matrix[joints[-1].index] @ rates) < 0 else 1.0
         geometry = self._tip(given, path, sign)
+        if "closing_axis" not in given and joints[-1].kind == "revolute":
+            # Of a linkage the last joint may turn back while the finger closes: what counts is where the tip goes.
+            opposed = self._travel(link, geometry[1], rates) @ np.cross(geometry[3], geometry[2] - geometry[1])
+            geometry = (*geometry[:3], -geometry[3] if opposed > 0 else geometry[3])
         return Finger(
             name=str(given.get("name", link)),
             link=link,
@@ -175,9 +200,18 @@ class UrdfHand(Hand):
             center, radius = fit_fingertip(self._solid(path[-1].name), origin, axis, distal)
         if slides:
             origin = center - VIRTUAL_REACH * (direction + distal) / math.sqrt(2)
+        else:  # the point of the joint's axis in the circle's plane
+            origin = origin + ((center - origin) @ axis) * axis
         if "outer_joint" in given:
             origin = np.array(given["outer_joint"], dtype=np.float64)
         return radius, center, origin.copy(), axis
+
+    def _travel(self, link: str, point: np.ndarray, rates: Float[Tensor, "J"]) -> np.ndarray:
+        """Return how a link's point moves, in its coordinates, when joints move at `rates` in mid-range."""
+        middle, step = self.limits.mean(dim=1), 1e-4
+        near = self.link_poses(torch.stack([middle - step * rates, middle + step * rates]))[link].numpy()
+        ends = near[:, :3, :3] @ point + near[:, :3, 3]
+        return (ends[1] - ends[0]) @ near[0, :3, :3]
 
     def _path(self, link: str) -> list[LinkRecord]:
         path, number = [], self.link_names.index(link)

@@ -1,7 +1,9 @@
 """A URDF as XML: read, cut down to the hand, checked; numbers of its joints and links."""
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import pinocchio as pin
@@ -14,12 +16,30 @@ from dexgrasp.urdf_geometry import numbers
 
 
 class UrdfFile:
-    """The part of a URDF below `root` (default: all of it). Every error names the file."""
+    """The part of a URDF below `root` (default: all of it). Every error names the file.
 
-    def __init__(self, path: Path, root: str | None = None) -> None:
+    `couplings`, `limits` and `efforts` replace what the file says of some joints, see `UrdfHand`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        root: str | None = None,
+        couplings: Mapping[str, Mapping[str, Any] | None] | None = None,
+        limits: Mapping[str, Sequence[float]] | None = None,
+        efforts: Mapping[str, float] | None = None,
+    ) -> None:
         self.path = path
-        self.robot = self._below(_parse(path), root)
+        self.robot = read_robot(path, root)
         self.joints = {joint.get("name", ""): joint for joint in self.robot.findall("joint")}
+        for name, coupling in (couplings or {}).items():
+            self._couple(self._joint(name, "couplings"), coupling)
+        for name, ends in (limits or {}).items():
+            joint = self._joint(name, "limits")
+            joint.set("type", "revolute" if joint.get("type") == "continuous" else joint.get("type", ""))
+            _limit(joint).attrib.update(zip(("lower", "upper"), map(str, ends), strict=False))
+        for name, effort in (efforts or {}).items():
+            _limit(self._joint(name, "efforts")).set("effort", str(effort))
         for joint in self.joints.values():
             if joint.get("type") == "continuous":
                 _bound(joint)
@@ -86,20 +106,27 @@ class UrdfFile:
         tags = {link.get("name", ""): link.find("inertial/mass") for link in self.robot.findall("link")}
         return {link: 0.0 if tag is None else float(numbers(tag, "value", "", 1)[0]) for link, tag in tags.items()}
 
-    def _below(self, robot: ElementTree.Element, root: str | None) -> ElementTree.Element:
-        names = [link.get("name", "") for link in robot.findall("link")]
-        if root is None:
-            return robot
-        if root not in names:
-            raise DexgraspError(f"a link of {self.path} as `root`", repr(root), f"name one of {', '.join(names)}")
-        joints, below = robot.findall("joint"), {root}
-        while grown := {_end(joint, "child") for joint in joints if _end(joint, "parent") in below} - below:
-            below |= grown
-        for link in [link for link in robot.findall("link") if link.get("name") not in below]:
-            robot.remove(link)
-        for joint in [joint for joint in joints if _end(joint, "parent") not in below]:
-            robot.remove(joint)
-        return robot
+    def _joint(self, name: str, key: str) -> ElementTree.Element:
+        if name not in self.joints:
+            raise DexgraspError(
+                f"a joint of {self.path} under `{key}`: {', '.join(self.joints)}", repr(name), "correct the hand's YAML"
+            )
+        return self.joints[name]
+
+    def _couple(self, joint: ElementTree.Element, coupling: Mapping[str, Any] | None) -> None:
+        """Give a joint that `<mimic>` tag, in place of its own; None frees it."""
+        for old in joint.findall("mimic"):
+            joint.remove(old)
+        if coupling is None:
+            return
+        strange = sorted(set(coupling) - {"joint", "multiplier", "offset"})
+        if strange or "joint" not in coupling:
+            raise DexgraspError(
+                f"joint, multiplier, offset of the coupling of {joint.get('name')!r}",
+                ", ".join(strange) or "no joint",
+                "correct `couplings` in the hand's YAML",
+            )
+        ElementTree.SubElement(joint, "mimic", {key: str(value) for key, value in coupling.items()})
 
     def _check_mimics(self) -> None:
         for name, joint in self.joints.items():
@@ -108,14 +135,34 @@ class UrdfFile:
                 target = mimic.get("joint", "")
                 if target not in self.joints or target in seen or self.joints[target].get("type") == "fixed":
                     kind = "a circle through" if target in seen else "a fixed" if target in self.joints else "no"
+                    alike = [joint for joint in self.joints if kind == "no" and joint.endswith(target)]
+                    hint = f" (it may mean {alike[0]!r})" if len(alike) == 1 else ""
                     raise DexgraspError(
                         f"a movable joint for {name!r} to mimic",
-                        f"{kind} joint {target!r} in {self.path}",
-                        "correct the <mimic> tag",
+                        f"{kind} joint {target!r} in {self.path}{hint}",
+                        "correct the <mimic> tag, or say it right under `couplings` in the hand's YAML",
                     )
                 numbers(mimic, "multiplier", "1", 1), numbers(mimic, "offset", "0", 1)
                 seen.add(target)
                 mimic = self.joints[target].find("mimic")
+
+
+def read_robot(path: Path, root: str | None = None) -> ElementTree.Element:
+    """Return the `<robot>` of a URDF, below the link `root` (default: all of it); its numbers are not looked at."""
+    robot = _parse(path)
+    names = [link.get("name", "") for link in robot.findall("link")]
+    if root is None:
+        return robot
+    if root not in names:
+        raise DexgraspError(f"a link of {path} as `root`", repr(root), f"name one of {', '.join(names)}")
+    joints, below = robot.findall("joint"), {root}
+    while grown := {_end(joint, "child") for joint in joints if _end(joint, "parent") in below} - below:
+        below |= grown
+    for link in [link for link in robot.findall("link") if link.get("name") not in below]:
+        robot.remove(link)
+    for joint in [joint for joint in joints if _end(joint, "parent") not in below]:
+        robot.remove(joint)
+    return robot
 
 
 def _parse(path: Path) -> ElementTree.Element:
@@ -133,10 +180,15 @@ def _parse(path: Path) -> ElementTree.Element:
 def _bound(joint: ElementTree.Element) -> None:
     """Give a continuous joint one turn, -pi..pi: then each joint is one number, in Pinocchio too."""
     joint.set("type", "revolute")
-    limit = joint.find("limit")
-    limit = ElementTree.SubElement(joint, "limit", effort="0", velocity="0") if limit is None else limit
+    limit = _limit(joint)
     limit.set("lower", repr(-math.pi))
     limit.set("upper", repr(math.pi))
+
+
+def _limit(joint: ElementTree.Element) -> ElementTree.Element:
+    """Return the <limit> tag of a joint, a new one where it has none."""
+    limit = joint.find("limit")
+    return ElementTree.SubElement(joint, "limit", effort="0", velocity="0") if limit is None else limit
 
 
 def _end(joint: ElementTree.Element, end: str) -> str:

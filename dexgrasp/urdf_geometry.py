@@ -9,8 +9,13 @@ from xml.etree import ElementTree
 import numpy as np
 import trimesh
 
+from dexgrasp.convex import convex_parts
 from dexgrasp.errors import DexgraspError
 
+DENT = 0.0015
+"""A hull that fills dents up to this depth stands for a mesh, m."""
+DEPTH = 0.004
+"""Where a mesh is cut into convex parts: twice the depth of the dents that these may fill, m."""
 logger = logging.getLogger(__name__)
 
 LARGEST_EXTENT = 2.0
@@ -34,17 +39,23 @@ def link_meshes(robot: ElementTree.Element, tag: str, urdf: Path) -> dict[str, l
     return meshes
 
 
-def convex(mesh: trimesh.Trimesh, link: str) -> trimesh.Trimesh:
-    """Return a collision mesh, or its convex hull where it is not convex (the log says by how much it grows)."""
+def convex_pieces(mesh: trimesh.Trimesh, link: str) -> tuple[trimesh.Trimesh, ...]:
+    """Return a collision mesh as convex parts: itself, its hull where that is as good, else a decomposition (cached).
+
+    A hull is as good where it stands nowhere more than `DENT` off the mesh.
+    """
     if mesh.is_convex:
-        return mesh
+        return (mesh,)
     hull = mesh.convex_hull
-    if mesh.is_watertight and mesh.volume > 0:
-        logger.info(
-            "link %s: a collision mesh of %.1f cm3 is not convex; its hull of %.1f cm3 stands for it",
-            link, mesh.volume * 1e6, hull.volume * 1e6,
-        )  # fmt: skip
-    return hull
+    points, _ = trimesh.sample.sample_surface(hull, 1000, seed=0)
+    dent = float(trimesh.proximity.closest_point(mesh, points)[1].max())
+    if dent <= DENT:
+        return (hull,)
+    mesh = mesh.copy()
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    parts = convex_parts(mesh, DEPTH)
+    logger.info("link %s: its hull would stand %.1f mm off the mesh; %d convex parts", link, 1e3 * dent, len(parts))
+    return parts
 
 
 def joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:

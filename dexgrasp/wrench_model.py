@@ -13,6 +13,13 @@ from dexgrasp.errors import DexgraspError
 
 Array = Tensor | np.ndarray
 HULLS = ("l1", "linf")
+TWO_FINGERS = 0.02
+"""Torsion of a hand with two fingers, m: hard contacts hold no torque about the line through them. As in `lift-v1`."""
+
+
+def torsion_of(fingers: int, torsion: float | None) -> float:
+    """Return the torsion (m) of the contacts of a hand with so many fingers; `torsion` where it is given."""
+    return (TWO_FINGERS if fingers == 2 else 0.0) if torsion is None else torsion
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,9 @@ def test_the_grid_never_promises_too_much(name):
     slack = exact - field.lower_bound(points)
     assert slack.min() > -1e-12
     assert slack[np.abs(exact) < 0.003].max() < 0.0036  # twice half a cell's diagonal
-    assert np.median(slack[(exact > 0.006) & (exact < 0.012)]) < 4e-4  # interpolation's variance over twice the distance
+    assert (
+        np.median(slack[(exact > 0.006) & (exact < 0.012)]) < 4e-4
+    )  # interpolation's variance over twice the distance
     assert (field.distance(points) <= exact + 1e-12).all()
     inside = (np.abs(points) < mesh.extents / 2).all(1)
     np.testing.assert_allclose(field.distance(points)[inside], exact[inside], atol=1e-12)

@@ -1,27 +1,21 @@
-"""Check a hand: every law that dexgrasp ships, one line each."""
+"""Tools for hands: `hand check` looks a hand over; `hand init` writes one from a URDF."""
 
 import argparse
-from pathlib import Path
+from importlib import import_module
+
+ACTIONS = {
+    "init": "write a hand's plugin folder from a URDF or MJCF file",
+    "check": "look a hand over: what is wrong, why it matters, how to mend it",
+}
+"""Each is a module `dexgrasp.commands.hand_<action>` with `add_arguments(parser)` and `run(chosen)`."""
 
 
 def main(argv: list[str]) -> int:
-    """Run ``hand check``; 0 where every law holds, else 1."""
+    """Run ``hand <action> ...``; return the exit status."""
     parser = argparse.ArgumentParser(prog="dexgrasp hand", description=__doc__)
-    check = parser.add_subparsers(dest="action", required=True).add_parser("check", help="try the laws on a hand")
-    check.add_argument("hand", help="name of an installed hand, or path of a YAML")
-    check.add_argument("--config-dir", type=Path, help="folder that holds hand/<name>.yaml")
+    parsers = parser.add_subparsers(dest="action", required=True)
+    for action, text in ACTIONS.items():
+        module = import_module(f"dexgrasp.commands.hand_{action}")
+        module.add_arguments(parsers.add_parser(action, help=text, description=module.__doc__))
     chosen = parser.parse_args(argv)
-
-    from dexgrasp.plugins import load_hand
-    from dexgrasp.testing import violations
-
-    in_folder = chosen.config_dir and chosen.config_dir / "hand" / f"{chosen.hand}.yaml"
-    hand = load_hand(str(in_folder) if in_folder else chosen.hand)
-    print(f"{hand.name}: joints {', '.join(hand.joint_names)}; fingers {', '.join(f.name for f in hand.fingers)}")
-    broken = 0
-    for law, error in violations("hand", hand):
-        print(f"{'FAILS' if error else 'holds'}  {law.__name__}")
-        if error:
-            broken += 1
-            print("         " + str(error).replace("\n", "\n       "))
-    return 1 if broken else 0
+    return int(import_module(f"dexgrasp.commands.hand_{chosen.action}").run(chosen))

@@ -12,6 +12,7 @@ from torch import Tensor
 from dexgrasp.batch import Batch
 from dexgrasp.contact_frame import place, to_disc
 from dexgrasp.dataset.surface import Surface
+from dexgrasp.execution import opened
 from dexgrasp.geometry import inverse
 from dexgrasp.hand import Hand
 
@@ -25,6 +26,10 @@ SHIFT, ROLL = 0.006, 0.15
 """How far a varied palm moves along the normal, m, and turns about it, rad."""
 SLOWEST, FASTEST = 0.15, 0.85
 """A finger's contact is drawn with its closing joints between these parts of their ranges."""
+
+
+BEND = 0.15
+"""Joints that close one finger together are drawn so far apart from each other, parts of their ranges."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +108,10 @@ class Contact(Proposer):
     def draw(self, surface: Surface, count: int, rng: np.random.Generator) -> Draws:
         """Directions of the finger are uniform on the half sphere over the tangent plane."""
         joints = _uniform(self.hand, rng, count)
-        _close_alike(self.hand, joints, torch.from_numpy(rng.uniform(SLOWEST, FASTEST, size=count)))
+        part = torch.from_numpy(rng.uniform(SLOWEST, FASTEST, size=(count, 1))).repeat(1, joints.shape[1])
+        if any(len(finger.closing) > 1 for finger in self.hand.fingers):
+            part = (part + torch.from_numpy(rng.normal(scale=BEND, size=part.shape))).clamp(0, 1)
+        _close_alike(self.hand, joints, part)
         unit = torch.from_numpy(_strata(rng, count, 2))
         angle, z = 2 * math.pi * unit[:, :1], 0.05 + 0.95 * unit[:, 1:]  # uniform z: uniform on the sphere
         xy = torch.sqrt(1 - z**2) * torch.cat([torch.cos(angle), torch.sin(angle)], dim=1)
@@ -122,16 +130,6 @@ class Contact(Proposer):
         points, normals = surface.points[draws.point], surface.normals[draws.point]
         pose = place(self.hand, draws.finger, points, normals, draws.place, draws.joints)
         return pose, opened(self.hand, draws.joints)
-
-
-def opened(hand: Hand, joints: Float[Tensor, "N J"]) -> Float[Tensor, "N J"]:
-    """Return the postures with every closing joint at the limit from which it closes."""
-    result = joints.clone()
-    for finger in hand.fingers:
-        for joint, rate in finger.closing.items():
-            place_ = hand.joint_names.index(joint)
-            result[:, place_] = hand.limits[place_, 0 if rate > 0 else 1].to(joints)
-    return result
 
 
 def _points(surface: Surface, count: int, rng: np.random.Generator) -> Int[Tensor, "N"]:
@@ -154,12 +152,13 @@ def _stirred(hand: Hand, parents: Draws, step: float, rng: np.random.Generator) 
 
 
 def _close_alike(hand: Hand, joints: Tensor, part: Tensor) -> None:
-    """Set every closing joint to the same part of its range, in place."""
+    """Set every closing joint to the same part (N,) or to its own part (N, J) of its range, in place."""
+    part = part if part.ndim == 2 else part[:, None].expand(-1, joints.shape[1])
     for finger in hand.fingers:
         for joint, rate in finger.closing.items():
             index = hand.joint_names.index(joint)
             low, high = hand.limits[index] if rate > 0 else hand.limits[index].flip(0)
-            joints[:, index] = low + (high - low) * part
+            joints[:, index] = low + (high - low) * part[:, index]
 
 
 def _uniform(hand: Hand, rng: np.random.Generator, count: int) -> Tensor:

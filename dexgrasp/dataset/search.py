@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dexgrasp.closing import CLOSED, MISSES, OFF_TIP, PENETRATES, close_fingers
+from dexgrasp.centring import Centring
+from dexgrasp.closing import CLOSED, MISSES, OFF_TIP, PENETRATES
 from dexgrasp.collision import HandShape, as_arrays
 from dexgrasp.dataset.proposals import Approach, Contact, Draws
 from dexgrasp.dataset.spread import distinct, regions, spread
@@ -20,7 +21,7 @@ from dexgrasp.hand_body import hand_body
 from dexgrasp.headroom import headroom
 from dexgrasp.objects import Object
 from dexgrasp.preview import BURIED, MISSED, SEEN, Preview
-from dexgrasp.wrench_model import WrenchModel
+from dexgrasp.wrench_model import WrenchModel, torsion_of
 
 PASS = 1.0
 """Hands are closed whose preview promises this much of the wanted epsilon: closing is dear, and seldom finds more."""
@@ -50,7 +51,9 @@ class Search:
     def __init__(self, hand: Hand, item: Object, surface: Surface, settings: SynthesisSettings) -> None:
         self.hand, self.item, self.surface, self.settings = hand, item, surface, settings
         self.body, self.shape, self.preview = hand_body(hand), HandShape(hand), Preview(hand)
-        self.model = WrenchModel(tuple(item.com), item.radius, settings.friction, settings.edges)
+        self.centring = Centring(hand)
+        torsion = torsion_of(len(hand.fingers), settings.torsion)
+        self.model = WrenchModel(tuple(item.com), item.radius, settings.friction, settings.edges, torsion)
         share = settings.approach
         self.proposers = [
             (palm, proposer, part)
@@ -178,9 +181,11 @@ class Search:
 
     def _close(self, drawn: Draws, pose: Float[Tensor, "N 4 4"], start: Float[Tensor, "N J"]) -> None:
         settings, body = self.settings, self.body
-        status, full, touches, _, _ = close_fingers(
-            body, self.surface.field.field, *as_arrays(pose, start), False, True, settings.penetration
+        bases, status, full, touches, _, _ = self.centring.close(
+            self.surface.field.field, *as_arrays(pose, start), True, settings.penetration
         )
+        pose = pose.clone()
+        pose[:, :3] = torch.from_numpy(bases)
         for code, reason in ((PENETRATES, "penetrates"), (MISSES, "finger misses"), (OFF_TIP, "touches off the tip")):
             self.rejected[reason] += int((status == code).sum())
         good = np.flatnonzero(status == CLOSED)

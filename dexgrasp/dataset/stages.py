@@ -32,6 +32,7 @@ from dexgrasp.seeds import stream
 from dexgrasp.settings import read
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import load_protocol
+from dexgrasp.wrench_model import torsion_of
 
 
 def key(index: int) -> str:
@@ -105,7 +106,8 @@ def make_verdicts(dataset: Dataset, index: int) -> Item:
     rng = stream(dataset.config["seed"], "verdicts", item.name)
     found = verify(dataset.hand, dataset.shape, item, grasps, settings.verify, settings.approach, rng)
     synthesis = settings.synthesis
-    told = metrics(grasps[found.grasp], item, synthesis.friction, synthesis.edges)
+    torsion = torsion_of(len(dataset.hand.fingers), synthesis.torsion)
+    told = metrics(grasps[found.grasp], item, synthesis.friction, synthesis.edges, torsion)
     tensors = found.tensors() | {METRIC + name: value.float() for name, value in told.items()}
     facts = {"name": item.name, "grasps": len(grasps)} | signature(settings.verify.rules) | tally(found.reason)
     return Item(key(index), tensors, facts)

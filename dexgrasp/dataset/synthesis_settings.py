@@ -11,6 +11,7 @@ class SynthesisSettings:
 
     friction: float = 0.5
     edges: int = 8
+    torsion: float | None = None
     epsilon: float = 0.05
     penetration: float = 0.001
     approach: float = 0.15

@@ -11,10 +11,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dexgrasp.distance import DistanceField
-from dexgrasp.execution import pregrasp
+from dexgrasp.execution import opened
 from dexgrasp.geometry import inverse, rotation_angle
 from dexgrasp.grasps import Grasps
 from dexgrasp.quality import epsilon, wrenches
+from dexgrasp.wrench_model import torsion_of
 
 if TYPE_CHECKING:
     from dexgrasp.closing import Closer, Closure
@@ -41,9 +42,10 @@ class TruthSettings:
     penetration: float = 0.001
     """Deepest that the closed hand may reach into the object, m."""
     epsilon: float = 0.05
-    """Least quality of the closed grasp; that of synthesis, as are the next two."""
+    """Least quality of the closed grasp; that of synthesis, as are the next three."""
     friction: float = 0.5
     edges: int = 8
+    torsion: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,15 +125,20 @@ class Truth:
             rows, body = (grasps.object == number).nonzero().flatten(), self.bodies[number]
             closure = self._closed(grasps[rows], number)
             touched[rows] = closure.touched.sum(dim=1)
-            cones = wrenches(closure.contacts, closure.normals, body.com, body.radius, limits.friction, limits.edges)
-            found = torch.as_tensor(epsilon(cones)).to(quality)
+            found = torch.as_tensor(epsilon(self._cones(closure.contacts, closure.normals, body))).to(quality)
             quality[rows] = torch.where(closure.penetration <= limits.penetration, found, 0.0)
         return free, touched, quality
 
     def _closed(self, grasps: Grasps, index: int) -> "Closure":
-        _, opened = pregrasp(self.closer.hand, grasps, opening=self.settings.opening)
+        start = opened(self.closer.hand, grasps.joints.double(), self.settings.opening)
         motion = self.object_T_frame[index]
-        return self.closer.close(self.bodies[index].field, motion @ grasps.pose.double(), opened.double())
+        return self.closer.close(self.bodies[index].field, motion @ grasps.pose.double(), start, centred=True)
+
+    def _cones(self, contacts: Float[Tensor, "N F 3"], normals: Float[Tensor, "N F 3"], body: Body) -> Tensor:
+        limits = self.settings
+        torsion = torsion_of(contacts.shape[1], limits.torsion)
+        found = wrenches(contacts, normals, body.com, body.radius, limits.friction, limits.edges, torsion)
+        return torch.as_tensor(found)
 
     def _closed_quality(self, grasps: Grasps, index: int) -> Float[Tensor, "N"]:
         """Return epsilon of grasps of one object after closing again; 0 where a check fails."""
@@ -141,6 +148,6 @@ class Truth:
         quality = grasps.quality.new_zeros(len(grasps))
         if good.any():
             contacts, normals = closure.contacts[good].double(), closure.normals[good].double()
-            cones = wrenches(contacts, normals, body.com, body.radius, limits.friction, limits.edges)
+            cones = self._cones(contacts, normals, body)
             quality[good] = torch.as_tensor(epsilon(cones, threshold=limits.epsilon)).to(quality)
         return quality

@@ -155,14 +155,16 @@ def at_rest(item: Object, simulator: MujocoSimulator) -> tuple[Float[Tensor, "K 
     return found[still], torch.from_numpy(likelihood[order].copy())[still]
 
 
-def metrics(grasps: Grasps, item: Object, friction: float, edges: int) -> dict[str, Float[Tensor, "N"]]:
+def metrics(
+    grasps: Grasps, item: Object, friction: float, edges: int, torsion: float = 0.0
+) -> dict[str, Float[Tensor, "N"]]:
     """Return what is known of grasps (object frame) without physics; of all of them more should be better.
 
     `epsilon` and `volume` are of the L1 hull, `epsilon_linf` of the L-infinity hull (METHOD section 5); `spread` is
     the contacts' mean distance from their centroid, `centred` minus the centroid's from the centre of mass, both m.
     """
     contacts, normals = grasps.contacts.double(), grasps.normals.double()
-    cones = wrenches(contacts, normals, item.com, item.radius, friction, edges)
+    cones = wrenches(contacts, normals, item.com, item.radius, friction, edges, torsion)
     fingers = contacts.shape[1]
     middle = contacts.mean(dim=1)
     offset = torch.linalg.vector_norm(middle - torch.as_tensor(item.com, dtype=torch.float64), dim=1)

@@ -12,10 +12,11 @@ from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.shard import Item
 from dexgrasp.dataset.store import Store
 from dexgrasp.errors import DexgraspError
-from dexgrasp.execution import pregrasp
+from dexgrasp.execution import opened
 from dexgrasp.grasps import Grasps
 from dexgrasp.quality import epsilon, wrenches
 from dexgrasp.seeds import stream
+from dexgrasp.wrench_model import torsion_of
 
 SCHEMAS: dict[str, dict[str, tuple[str | int, ...]]] = {
     "objects": {"vertices": ("v", 3), "faces": ("f", 3), "com": (3,), "size": (2,), "stable_poses": ("k", 4, 4)},
@@ -95,6 +96,7 @@ def rechecked(dataset: Dataset, grasps: int, scenes: int, seed: int = 0) -> Iter
 
 def _grasps(dataset: Dataset, count: int, seed: int) -> Iterator[Check]:
     settings = stages.settings_of(dataset).synthesis
+    torsion = torsion_of(len(dataset.hand.fingers), settings.torsion)
     kept = np.array([len(dataset.grasps(i)) for i in range(len(dataset.store("grasps")))])
     if not kept.sum():
         yield Check("grasps", True, "none are there")
@@ -106,11 +108,11 @@ def _grasps(dataset: Dataset, count: int, seed: int) -> Iterator[Check]:
         own = dataset.grasps(int(number))[torch.from_numpy(drawn[owner == number] - (kept.cumsum() - kept)[number])]
         own = own.to(torch.float64)
         body = dataset.body(int(number))
-        cones = wrenches(own.contacts, own.normals, body.com, body.radius, settings.friction, settings.edges)
+        cones = wrenches(own.contacts, own.normals, body.com, body.radius, settings.friction, settings.edges, torsion)
         errors.append((torch.as_tensor(epsilon(cones)) - own.quality).abs())
         least.append(own.quality)
-        _, opened = pregrasp(dataset.hand, own, settings.retreat, settings.opening)
-        closure = dataset.closer.close(body.field, own.pose, opened.double())
+        start = opened(dataset.hand, own.joints, settings.opening)
+        closure = dataset.closer.close(body.field, own.pose, start, centred=True)
         depths.append(closure.penetration)
         away = torch.linalg.vector_norm(closure.contacts - own.contacts, dim=-1)
         moved.append(away.nan_to_num(nan=torch.inf).max(dim=1).values)

@@ -54,6 +54,9 @@ def add_hand(spec: mujoco.MjSpec, hand: Hand, physics: Physics) -> None:
                 mass=0.0,
             )
     _exclude_own(spec, fingers)
+    for first, second in getattr(hand, "allowed_contacts", ()):
+        if fingers.get(first) != fingers.get(second):  # those of one finger are left out already
+            spec.add_exclude(bodyname1=f"hand/{first}", bodyname2=f"hand/{second}")
     spec.add_equality(
         name="wrist",
         type=mujoco.mjtEq.mjEQ_WELD,

@@ -91,10 +91,14 @@ def kinematics_agree_with_pinocchio(hand: Hand) -> None:
         for joint in ElementTree.parse(urdf).getroot().findall("joint")
         if (mimic := joint.find("mimic")) is not None
     }
+    for joint, told in getattr(hand, "couplings", {}).items():
+        mimics.pop(joint, None)
+        if told is not None:
+            mimics[joint] = ElementTree.Element("mimic", {key: str(value) for key, value in told.items()})
     data = model.createData()
     vectors = samples.joints(hand, 8, seed=4)
     poses = hand.link_poses(vectors)
-    root = next(frame.name for frame in list(model.frames)[1:] if frame.type == pin.FrameType.BODY)
+    root = hand.link_names[0]
     for row, vector in enumerate(vectors):
         pin.framesForwardKinematics(
             model, data, _configuration(model, mimics, dict(zip(hand.joint_names, vector.tolist(), strict=True)))
@@ -184,8 +188,8 @@ def _expect_rigid(pose: Tensor, tolerance: float, what: str) -> None:
 
 def _configuration(model: pin.Model, mimics: dict[str, ElementTree.Element], known: dict[str, float]) -> np.ndarray:
     def value(joint: str) -> float:
-        if joint not in mimics:
-            return known[joint]
+        if joint in known or joint not in mimics:
+            return known.get(joint, 0.0)  # an arm's joints do not move links against each other
         tag = mimics[joint]
         return float(tag.get("multiplier", 1)) * value(tag.get("joint", "")) + float(tag.get("offset", 0))
 

@@ -1,0 +1,123 @@
+"""A hand in the browser: joint sliders, frames, contacts, collision shapes."""
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import trimesh
+
+from dexgrasp.execution import closing_direction
+from dexgrasp.hand import Hand
+from dexgrasp.simulation.hand_model import quaternion
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+SOLID = (240, 150, 60)
+MARK = (20, 20, 20)
+
+
+class HandView:
+    """One hand on a page; the palm frame of `base_T_palm` is shown, and each fingertip's frame and pad-first contact.
+
+    Args:
+        server: the page (`open_page`).
+        hand: any hand.
+        name: where it hangs in the scene.
+    """
+
+    def __init__(self, server: "ViserServer", hand: Hand, name: str = "hand") -> None:
+        self.server, self.hand, self.name = server, hand, name
+        self.frames: dict[str, Any] = {}
+        self.solids: list[Any] = []
+        self.seen: list[Any] = []
+        self._add_meshes()
+        self._add_marks()
+        self.sliders = self._add_sliders()
+        self.move()
+
+    @property
+    def joints(self) -> torch.Tensor:
+        """Joints (J,) that the sliders show, rad (m where prismatic)."""
+        return torch.tensor([slider.value for slider in self.sliders], dtype=torch.float64)
+
+    @joints.setter
+    def joints(self, values: torch.Tensor) -> None:
+        for slider, value in zip(self.sliders, self.hand.clamp(values[None])[0].tolist(), strict=True):
+            slider.value = value
+        self.move()
+
+    def move(self) -> None:
+        """Put every link where the sliders say."""
+        joints = self.joints[None]
+        poses = {link: pose[0].numpy() for link, pose in self.hand.link_poses(joints).items()}
+        for finger, tip in zip(self.hand.fingers, self.hand.fingertips(joints)[0].numpy(), strict=True):
+            poses[f"tips/{finger.name}"] = tip
+        with self.server.atomic():
+            for place, frame in self.frames.items():
+                frame.position, frame.wxyz = poses[place][:3, 3], quaternion(poses[place][:3, :3])
+
+    def closed_by(self, part: float) -> None:
+        """Bring the closing joints to `part` (0 open, 1 closed) of their ranges."""
+        direction = closing_direction(self.hand)
+        low, high = self.hand.limits.T
+        start, end = torch.where(direction < 0, high, low), torch.where(direction < 0, low, high)
+        self.joints = torch.where(direction != 0, start + part * (end - start), self.joints)
+
+    def _add_meshes(self) -> None:
+        scene = self.server.scene
+        for link in self.hand.link_names:
+            place = f"/{self.name}/{link}"
+            self.frames[link] = scene.add_frame(place, show_axes=False)
+            if link in self.hand.visuals:
+                self.seen.append(scene.add_mesh_trimesh(f"{place}/visual", self.hand.visuals[link]))
+            for number, part in enumerate(self.hand.collisions.get(link, ())):
+                self.solids.append(
+                    scene.add_mesh_simple(
+                        f"{place}/collision_{number}", np.asarray(part.vertices, np.float32), np.asarray(part.faces),
+                        color=SOLID, opacity=0.5, flat_shading=True, visible=False,
+                    )
+                )  # fmt: skip
+
+    def _add_marks(self) -> None:
+        palm = self.hand.base_T_palm.numpy()
+        size = 0.06
+        self.server.scene.add_frame(
+            f"/{self.name}/palm_frame", axes_length=size, axes_radius=0.03 * size,
+            position=palm[:3, 3], wxyz=quaternion(palm[:3, :3]),
+        )  # fmt: skip
+        for finger in self.hand.fingers:
+            place = f"/{self.name}/tips/{finger.name}"
+            self.frames[f"tips/{finger.name}"] = self.server.scene.add_frame(
+                place, axes_length=2 * finger.tip_radius, axes_radius=0.06 * finger.tip_radius
+            )
+            ball = trimesh.creation.icosphere(2, 0.2 * finger.tip_radius)
+            ball.apply_translation([0, -finger.tip_radius, 0])
+            self.server.scene.add_mesh_simple(
+                f"{place}/contact", np.asarray(ball.vertices, np.float32), np.asarray(ball.faces), color=MARK
+            )
+
+    def _add_sliders(self) -> list[Any]:
+        gui, sliders = self.server.gui, []
+        with gui.add_folder(f"joints of {self.hand.name}"):
+            start = self.hand.clamp(torch.zeros(1, len(self.hand.joint_names), dtype=torch.float64))[0]
+            for joint, (low, high), value in zip(
+                self.hand.joint_names, self.hand.limits.tolist(), start.tolist(), strict=True
+            ):
+                wide = max(high - low, 1e-6)
+                slider = gui.add_slider(joint, low, low + wide, step=wide / 200, initial_value=value)
+                slider.on_update(lambda _: self.move())
+                sliders.append(slider)
+            closing = gui.add_slider("close all fingers", 0.0, 1.0, step=0.01, initial_value=0.0)
+            closing.on_update(lambda event: self.closed_by(event.target.value))
+        with gui.add_folder("show"):
+            for text, handles, on in (("visual meshes", self.seen, True), ("collision parts", self.solids, False)):
+                box = gui.add_checkbox(text, initial_value=on)
+                box.on_update(partial(_show, handles))
+        return sliders
+
+
+def _show(handles: list[Any], event: Any) -> None:
+    for handle in handles:
+        handle.visible = event.target.value

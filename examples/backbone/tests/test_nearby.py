@@ -1,0 +1,6 @@
+from dexgrasp.testing import conforms
+
+
+@conforms("nearby")
+def test(backbone, check):
+    check(backbone)

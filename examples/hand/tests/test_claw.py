@@ -1,0 +1,6 @@
+from dexgrasp.testing import conforms
+
+
+@conforms("claw")
+def test(hand, check):
+    check(hand)

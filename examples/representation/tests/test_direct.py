@@ -1,0 +1,6 @@
+from dexgrasp.testing import conforms
+
+
+@conforms("direct")
+def test(representation, check):
+    check(representation)

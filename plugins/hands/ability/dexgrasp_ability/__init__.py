@@ -1,0 +1,1 @@
+"""Psyonic Ability hand (right): five fingers, six motors, coupled outer joints."""

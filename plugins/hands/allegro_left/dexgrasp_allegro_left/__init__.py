@@ -1,0 +1,1 @@
+"""Allegro hand (left): four fingers of four independent joints."""

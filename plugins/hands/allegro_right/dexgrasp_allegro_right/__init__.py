@@ -1,0 +1,1 @@
+"""Allegro hand (right): four fingers of four independent joints."""

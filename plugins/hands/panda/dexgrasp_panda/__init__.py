@@ -1,0 +1,1 @@
+"""Franka hand without its arm: a parallel jaw, moved by one joint."""
