@@ -47,13 +47,13 @@ class Scan:
         self.body = body
         self.rates = body.rates @ body.coupling.T
         self.poses = np.empty((len(body.parents), 3, 4))
-        self.object = fcl.CollisionObject(_model(mesh))
+        self.object = fcl.CollisionObject(fcl_model(mesh))
         self.ask = fcl.CollisionRequest()
         self.fingers = []
         for rate, speeds in zip(self.rates, body.cover.patch_speeds, strict=True):
             moved = [link for link in range(len(body.parents)) if self._moves(link, rate)]
             parts = [
-                (link, fcl.CollisionObject(_model(part)))
+                (link, fcl.CollisionObject(fcl_model(part)))
                 for link in moved
                 for part in hand.collisions.get(hand.tree[link].name, ())
             ]
@@ -84,11 +84,18 @@ class Scan:
             full = np.clip(start + rate * low, *body.limits.T)
         return full
 
+    def place(self, pose: np.ndarray, full: np.ndarray, finger: int) -> None:
+        """Put the links that a finger moves where full joints (M,) have them."""
+        self._place(pose, full, self.fingers[finger][0])
+
+    def _place(self, pose: np.ndarray, full: np.ndarray, moved: list[int]) -> None:
+        for link in moved:
+            place_link(self.body.motions, link, full, pose, self.poses)
+
     def _collides(
         self, pose: np.ndarray, full: np.ndarray, moved: list[int], parts: list[tuple[int, fcl.CollisionObject]]
     ) -> bool:
-        for link in moved:
-            place_link(self.body.motions, link, full, pose, self.poses)
+        self._place(pose, full, moved)
         for link, part in parts:
             part.setTransform(fcl.Transform(self.poses[link, :, :3], self.poses[link, :, 3]))
             if fcl.collide(part, self.object, self.ask, fcl.CollisionResult()):
@@ -103,7 +110,7 @@ class Scan:
         return False
 
 
-def _model(mesh: trimesh.Trimesh) -> fcl.BVHModel:
+def fcl_model(mesh: trimesh.Trimesh) -> fcl.BVHModel:
     model = fcl.BVHModel()
     model.beginModel(len(mesh.faces), len(mesh.vertices))
     model.addSubModel(np.asarray(mesh.vertices), np.asarray(mesh.faces))
