@@ -116,7 +116,7 @@ def test_help_lists_every_installed_choice(command):
 @pytest.mark.parametrize(
     ("wrong", "expected"),
     [
-        (["hand=baret"], ["an installed hand: barrett", "'baret'", "did you mean 'barrett'"]),
+        (["hand=baret"], ["an installed hand: ", "barrett", "'baret'", "did you mean 'barrett'"]),
         (["part=smal"], ["part", "did you mean 'small'", "large, small"]),
         (["trainer.step=3"], ["'trainer.step'", "did you mean 'trainer.steps'"]),
         (["trainer.ratte=3"], ["did you mean 'trainer.rate'"]),
