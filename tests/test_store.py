@@ -15,6 +15,7 @@ from dexgrasp.dataset import shard as module
 from dexgrasp.dataset.claims import claim, lock
 from dexgrasp.dataset.shard import Item, write_shard
 from dexgrasp.dataset.store import Store, digest, recorded
+from dexgrasp.dataset.temporary import sweep, temporary
 from dexgrasp.errors import DexgraspError
 
 CONFIG = {"a": 1, "b": {"c": [1.5, "x"]}}
@@ -195,3 +196,26 @@ def test_shards_written_elsewhere_are_seen(tmp_path: Path) -> None:
         "manifest.json",
         *(f"shard-0000{i}.tar" for i in range(3)),
     ]
+
+
+def _write_for_ever(path: Path) -> None:
+    temporary(path).write_bytes(b"half")
+    time.sleep(600)
+
+
+def test_what_a_killed_worker_was_writing_is_swept_up_and_nothing_else(tmp_path: Path) -> None:
+    worker = multiprocessing.get_context("spawn").Process(target=_write_for_ever, args=(tmp_path / "shard-00000.json",))
+    worker.start()
+    while not list(tmp_path.glob(".*.tmp")):
+        assert worker.is_alive()
+        time.sleep(0.01)
+    ours = temporary(tmp_path / "shard-00001.json")
+    ours.write_bytes(b"half")
+    elsewhere = tmp_path / ".shard-00002.json.another-host-7.tmp"
+    elsewhere.write_bytes(b"half")
+    sweep(tmp_path)
+    assert len(list(tmp_path.iterdir())) == 3
+    worker.kill()
+    worker.join()
+    sweep(tmp_path)
+    assert set(tmp_path.iterdir()) == {ours, elsewhere}

@@ -3,7 +3,7 @@
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import torch
 from dexgrasp.dataset.claims import claim, lock
 from dexgrasp.dataset.shard import Item, Shard, shard_name, write_shard
 from dexgrasp.dataset.store import Store, recorded
+from dexgrasp.dataset.temporary import sweep
 from dexgrasp.errors import DexgraspError
 from dexgrasp.progress import track
 
@@ -90,14 +91,18 @@ def make_store(folder: Path, stage: Stage, seed: int, start: Callable[[], joblib
         began = time.perf_counter()
         pieces = {i: work[i * per_shard : (i + 1) * per_shard] for i in store.missing}
         shards = _shards(store, stage, pieces, start, share)
-        for _ in track((None for shard in shards for _ in shard.items), stage.name, sum(map(len, pieces.values()))):
-            pass
+        try:
+            for _ in track((None for shard in shards for _ in shard.items), stage.name, sum(map(len, pieces.values()))):
+                pass
+        finally:
+            shards.close()  # ends the workers; one that was killed while it wrote could not clear up
+            sweep(folder)
         store.finish(time.perf_counter() - began)
 
 
 def _shards(
     store: Store, stage: Stage, pieces: Mapping[int, Sequence[Any]], start: Callable[[], joblib.Parallel], share: Share
-) -> Iterator[Shard]:
+) -> Generator[Shard, None, None]:
     """Yield all missing shards as they come to be there."""
     while store.missing:
         tasks = ((store.folder, i, stage.make, pieces[i]) for i in share.order(store.missing))

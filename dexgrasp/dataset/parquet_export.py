@@ -1,7 +1,6 @@
 """Grasps as Parquet: one row a grasp, and one row for each scene in which it is feasible."""
 
 import os
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import numpy as np
 import torch
 
 from dexgrasp.dataset.dataset import Dataset
+from dexgrasp.dataset.temporary import temporary
 from dexgrasp.errors import DexgraspError
 from dexgrasp.progress import track
 
@@ -109,7 +109,7 @@ def _write(path: Path, groups: Iterator[dict[str, Any]], metadata: dict[str, str
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    temporary = path.with_name(f".{path.name}.{socket.gethostname()}-{os.getpid()}.tmp")
+    unfinished = temporary(path)
     writer = None
     try:
         for group in groups:
@@ -117,15 +117,15 @@ def _write(path: Path, groups: Iterator[dict[str, Any]], metadata: dict[str, str
             if writer is None:
                 fields = [pa.field(n, c.type, metadata={"meaning": MEANING[n]}) for n, c in columns.items()]
                 schema = pa.schema(fields, metadata=metadata)
-                writer = pq.ParquetWriter(temporary, schema, compression="zstd")
+                writer = pq.ParquetWriter(unfinished, schema, compression="zstd")
             writer.write_table(pa.table(list(columns.values()), schema=schema))
         if writer is None:
             return None
         writer.close()
-        os.replace(temporary, path)
+        os.replace(unfinished, path)
         return path
     finally:
-        temporary.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
 
 
 def _column(values: Any) -> Any:

@@ -5,7 +5,6 @@ import io
 import json
 import os
 import resource
-import socket
 import tarfile
 import time
 from collections.abc import Iterable, Mapping
@@ -16,6 +15,7 @@ from typing import Any
 import safetensors.torch
 from torch import Tensor
 
+from dexgrasp.dataset.temporary import temporary
 from dexgrasp.errors import room
 
 
@@ -89,16 +89,16 @@ def append(tar: tarfile.TarFile, name: str, content: bytes) -> tuple[int, int]:
 
 def write_whole(path: Path, content: bytes | memoryview) -> None:
     """Write a file under a name of this process's own, sync it and rename it: under `path` it is whole or absent."""
-    temporary = path.with_name(f".{path.name}.{socket.gethostname()}-{os.getpid()}.tmp")
+    unfinished = temporary(path)
     with room(f"{len(content)} bytes", path.parent):
         try:
-            with open(temporary, "wb") as file:
+            with open(unfinished, "wb") as file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
-            os.replace(temporary, path)
+            os.replace(unfinished, path)
         except BaseException:
-            temporary.unlink(missing_ok=True)
+            unfinished.unlink(missing_ok=True)
             raise
         folder = os.open(path.parent, os.O_RDONLY)
         try:
