@@ -13,8 +13,10 @@ REACH = 1.25
 """The fingertip reaches so many radii about the circle's centre, seen along the closing axis; as in closing."""
 SIDES = 16
 """Of the prism by which the fingertip is cut off its link."""
-FLAT = 2e-4
-"""Corners whose heights differ by less than about this touch together: their mean is told, which smooths facets, m."""
+SAMPLES = 1500
+"""Points drawn on each fingertip's surface, by which its touching part is found."""
+FLAT = 4e-4
+"""What is lower than the farthest point by less than about this touches too: its middle is told, m."""
 
 
 class TipSurface:
@@ -25,32 +27,43 @@ class TipSurface:
     """
 
     def __init__(self, hand: Hand) -> None:
-        self.tips = [_corners(hand, finger) for finger in hand.fingers]
-        """Corners of each, in the tip frame, m, float64."""
+        self.tips = [_surface(hand, finger) for finger in hand.fingers]
+        """Corners and evenly drawn points of each, in the tip frame, m, float64."""
         self.radii = [finger.tip_radius for finger in hand.fingers]
 
     def support(self, finger: Int[Tensor, "N"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Return the points of fingertips (m) that are farthest in unit directions, both in the tip frame.
 
-        The middle of a flat that faces the direction, weighing its corners smoothly by how far out they are.
+        As far out as the farthest corner, and there the middle of what is within `FLAT` of it, so that facets are
+        smoothed over and a flat that faces the direction touches with its middle.
         """
         found = torch.empty_like(directions)
-        for index, (tip, radius) in enumerate(zip(self.tips, self.radii, strict=True)):
+        for index, ((corners, points), radius) in enumerate(zip(self.tips, self.radii, strict=True)):
             rows = (finger == index).nonzero().flatten()
-            towards, corners = directions[rows], tip.to(directions)
-            weights = (towards @ corners.T / FLAT).softmax(-1)
-            found[rows] = weights @ corners if len(tip) else radius * towards
+            towards = directions[rows]
+            if not len(corners):
+                found[rows] = radius * towards
+                continue
+            height = (towards @ corners.to(directions).T).amax(-1, keepdim=True)
+            below = height - towards @ points.to(directions).T
+            middle = (-below / FLAT).softmax(-1) @ points.to(directions)
+            found[rows] = middle + (height - (middle * towards).sum(-1, keepdim=True)) * towards
         return found
 
 
-def _corners(hand: Hand, finger: Finger) -> Float[Tensor, "K 3"]:
-    """Return the corners of a fingertip in the tip frame; none where its link has no parts."""
+def _surface(hand: Hand, finger: Finger) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "S 3"]]:
+    """Return corners and drawn points of a fingertip in the tip frame; none where its link has no parts."""
     tip_T_link = inverse(tip_frame(finger)).numpy()
     reach, turn = REACH * finger.tip_radius, np.arange(SIDES) * 2 * np.pi / SIDES
     outward = np.stack([np.cos(turn), np.sin(turn), np.zeros(SIDES)], axis=1)
-    found = [np.empty((0, 3))]
+    parts = []
     for part in hand.collisions.get(finger.link, ()):
         cut = trimesh.convex.convex_hull(trimesh.transform_points(part.vertices, tip_T_link))
-        cut = cut.slice_plane(reach * outward, -outward)  # no caps: of the cut, too, the corners are all that counts
-        found.append(np.asarray(cut.vertices).reshape(-1, 3))
-    return torch.from_numpy(np.unique(np.concatenate(found), axis=0))
+        cut = cut.slice_plane(reach * outward, -outward)  # without caps: no part of the fingertip's surface
+        parts += [cut] if len(cut.faces) else []
+    if not parts:
+        nothing = torch.empty(0, 3, dtype=torch.float64)
+        return nothing, nothing
+    whole = trimesh.util.concatenate(parts)
+    points, _ = trimesh.sample.sample_surface(whole, SAMPLES, seed=0)
+    return torch.from_numpy(np.array(whole.vertices)), torch.from_numpy(np.array(points))

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dexgrasp.contact_frame import contact_frame, finger_direction, tip_rotation
+from dexgrasp.contact_frame import SINGULAR, contact_frame, finger_direction, tip_rotation
 from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import axis_angle, inverse, pose
 from dexgrasp.grasps import Grasps
@@ -69,7 +69,7 @@ class ContactRoll(StagedContact):
         xy, z = xyz[:, :2], xyz[:, 2:]
         radius = torch.linalg.vector_norm(xy, dim=-1, keepdim=True)
         # Straight into the surface (-n) every side is right; one is chosen.
-        outward = torch.where(radius > 0, xy / radius.clamp(min=1e-12), xy.new_tensor([1.0, 0.0]))
+        outward = torch.where(radius > SINGULAR, xy / radius.clamp(min=SINGULAR), xy.new_tensor([1.0, 0.0]))
         folded = torch.where(z >= 0, xy, outward * (2 - radius))
         straight = tip_rotation(rotation[:, :, 0], frame)
         turned = straight.transpose(-1, -2) @ rotation[:, :, 2:]
