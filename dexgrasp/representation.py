@@ -44,7 +44,7 @@ class Representation(nn.Module, ABC):
     resolution: tuple[float, float] = (1e-5, 1e-4)
     """How far decode(encode) may move a grasp that can be told: m, rad."""
 
-    def touching(self, finger: Int[Tensor, "N"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    def tip_contacts(self, finger: Int[Tensor, "N"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Return where fingertips 0..F-1 are taken to touch a surface that lies in unit `directions` from them.
 
         Both in the tip frame (`Hand.fingertips`), the point in m; here the fingertip circle's ball. The laws try grasps

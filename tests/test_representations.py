@@ -34,7 +34,7 @@ def touched(model, grasps, seed=3):
     """Points and normals at which the grasps' fingers touch surfaces of any direction."""
     tips = (grasps.pose.unsqueeze(1) @ model.hand.fingertips(grasps.joints))[torch.arange(len(grasps)), grasps.finger]
     normals = normalize(random(len(grasps), 3, seed=seed), dim=-1)
-    return transform(tips, model.touching(grasps.finger, -rotate(inverse(tips), normals))), normals
+    return transform(tips, model.tip_contacts(grasps.finger, -rotate(inverse(tips), normals))), normals
 
 
 def there_and_back(model, points, normals, grasps):
@@ -74,7 +74,7 @@ def test_a_finger_straight_into_the_surface_is_told(hand):
     tips = (grasps.pose.unsqueeze(1) @ hand.fingertips(grasps.joints))[torch.arange(6), grasps.finger]
     for sign in (1, -1):
         normals = sign * tips[:, :3, 0]
-        points = transform(tips, model.touching(grasps.finger, -rotate(inverse(tips), normals)))
+        points = transform(tips, model.tip_contacts(grasps.finger, -rotate(inverse(tips), normals)))
         _, told = there_and_back(model, points, normals, grasps)
         torch.testing.assert_close(told.pose, grasps.pose, atol=1e-6, rtol=0)
 

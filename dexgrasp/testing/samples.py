@@ -48,7 +48,7 @@ def grasps(representation: Representation, count: int, seed: int = 0, lean: floa
     side = lean * (2 * torch.rand(count, 1, generator=generator, dtype=torch.float64) - 1)
     normals = side.cos() * (rise.cos() * v + rise.sin() * u) + side.sin() * w
     inward = -geometry.rotate(geometry.inverse(tip), normals)
-    points = geometry.transform(tip, representation.touching(finger, inward))
+    points = geometry.transform(tip, representation.tip_contacts(finger, inward))
     quality = torch.rand(count, generator=generator, dtype=torch.float64)
     return points, normals, Grasps.build(pose, posture, len(hand.fingers), finger=finger, quality=quality)
 

@@ -37,7 +37,7 @@ class ContactRoll(StagedContact):
         """The fingertips' surfaces."""
         return TipSurface(self.hand)
 
-    def touching(self, finger: Int[Tensor, "N"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    def tip_contacts(self, finger: Int[Tensor, "N"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Return the support points of the fingertips."""
         return self.tips.support(finger, directions)
 
@@ -105,7 +105,7 @@ class ContactRoll(StagedContact):
         u = (frame @ xyz.unsqueeze(-1)).squeeze(-1)
         rotation = axis_angle(u, torch.atan2(told[:, 2], told[:, 3])) @ tip_rotation(u, frame)
         inward = -(rotation.transpose(-1, -2) @ normals.unsqueeze(-1)).squeeze(-1)
-        center = points - (rotation @ self.touching(finger, inward).unsqueeze(-1)).squeeze(-1)
+        center = points - (rotation @ self.tip_contacts(finger, inward).unsqueeze(-1)).squeeze(-1)
         return pose(rotation, center) @ inverse(self._tip(finger, joints))
 
     def _tip(self, finger: Int[Tensor, "N"], joints: Float[Tensor, "N J"]) -> Float[Tensor, "N 4 4"]:

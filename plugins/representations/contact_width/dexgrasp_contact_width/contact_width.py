@@ -74,7 +74,7 @@ class ContactWidth(Representation):
         self.stage_1 = Heads(channels, {"finger": len(hand.fingers) + 1}, hidden, separate=separate_heads)
         self.stage_2 = Heads(channels, sizes, hidden, separate=separate_heads)
 
-    def touching(self, finger: Int[Tensor, "N"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    def tip_contacts(self, finger: Int[Tensor, "N"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Return the pads' middles, whatever the direction."""
         closed = self.hand.limits[:, 0].unsqueeze(0)
         tips = self.hand.fingertips(closed)[0, :, :3, :3]
@@ -104,7 +104,7 @@ class ContactWidth(Representation):
         joints[:, self.jaws.joint] = self.joints.join(logits, residuals, self._joint(len(points), points))[:, 0]
         rotation = geometry.orthonormal(prediction["directions"]) @ self.jaws.frames(finger, points).transpose(-1, -2)
         base_T_tip = self.hand.fingertips(joints)[torch.arange(len(finger), device=finger.device), finger]
-        pad = geometry.transform(base_T_tip, self.touching(finger, points))
+        pad = geometry.transform(base_T_tip, self.tip_contacts(finger, points))
         base = geometry.pose(rotation, points - (rotation @ pad.unsqueeze(-1)).squeeze(-1))
         return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0])
 

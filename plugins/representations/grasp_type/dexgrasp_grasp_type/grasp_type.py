@@ -142,7 +142,7 @@ class GraspType(Representation):
         tips = self.hand.fingertips(joints)[row, finger]
         frame_R_tip = rotation @ tips[:, :3, :3]
         inward = -(frame_R_tip.transpose(-1, -2) @ normals.unsqueeze(-1)).squeeze(-1)
-        touched = geometry.transform(tips, self.touching(finger, inward))  # by the finger, base frame
+        touched = geometry.transform(tips, self.tip_contacts(finger, inward))  # by the finger, base frame
         base = points - (rotation @ touched.unsqueeze(-1)).squeeze(-1)
         palm = base + rotation @ base_T_palm[:3, 3]
         depth = ((points - palm) * approach).sum(-1)
