@@ -1,6 +1,5 @@
 """Heads that tell a grasp from one fingertip contact in three stages: finger, direction and main joints, the rest."""
 
-import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 
@@ -330,17 +329,6 @@ def _without_likeliest(projection: Float[Tensor, "N V A K"], count: int) -> Floa
     logits, told = projection[..., :1], projection[..., 1:]
     best = logits.topk(count, dim=2).indices
     return torch.cat([logits.scatter(2, best, torch.finfo(logits.dtype).min), told], dim=-1)
-
-
-def golden_spiral(count: int, lowest: float = 0.0) -> Float[Tensor, "A 3"]:
-    """Return unit vectors, float64, spread evenly over the part of the sphere with z > `lowest`; a single one is +z."""
-    if count == 1:
-        return torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-    number = torch.arange(count, dtype=torch.float64)
-    z = 1 - (1 - lowest) * (number + 0.5) / count
-    turn = math.pi * (3 - 5**0.5) * number
-    radius = (1 - z * z).sqrt()
-    return torch.stack([radius * turn.cos(), radius * turn.sin(), z], dim=-1)
 
 
 def _kinds(hand: Hand) -> Int[Tensor, "F J"]:

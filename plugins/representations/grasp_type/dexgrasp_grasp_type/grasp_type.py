@@ -16,7 +16,6 @@ from dexgrasp.hand import Hand
 from dexgrasp.heads import CERTAIN, Heads, contact_points, finger_loss, known_points, mean, told_grasps
 from dexgrasp.representation import Prediction, Representation, Targets
 from dexgrasp.seeds import stream
-from dexgrasp.staged_contact import golden_spiral
 from dexgrasp_grasp_type.bins import Bins
 from dexgrasp_grasp_type.taxonomy import drawn_postures, nearest_type, taxonomy
 
@@ -91,7 +90,7 @@ class GraspType(Representation):
         self.angle = Bins(-math.pi, 2 * math.pi / angles, angles, wraps=True)
         near, far = _depths(hand)
         self.depth = Bins(near, (far - near) / depths, depths)
-        self.register_buffer("anchors", golden_spiral(approaches, lowest=-1.0), persistent=False)
+        self.register_buffer("anchors", geometry.golden_spiral(approaches, lowest=-1.0), persistent=False)
         self.register_buffer("ranges", torch.where(upper > lower, upper - lower, 1.0).float(), persistent=False)
         self.register_buffer("centres", drawn_postures(hand, types).float())  # learnt: part of the checkpoint
         self.anchors: Tensor
