@@ -1,10 +1,11 @@
 """What an epsilon is about, as one value that is stored with it: `WrenchModel`, and `Quality`, figures with theirs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from dexgrasp import quality
@@ -14,11 +15,11 @@ from dexgrasp.errors import DexgraspError
 Array = Tensor | np.ndarray
 HULLS = ("l1", "linf")
 TWO_FINGERS = 0.02
-"""Torsion of a hand with two fingers, m: hard contacts hold no torque about the line through them. As in `lift-v1`."""
+"""Torsion where two fingers touch, m: hard contacts hold no torque about the line through them. As in `lift-v1`."""
 
 
 def torsion_of(fingers: int, torsion: float | None) -> float:
-    """Return the torsion (m) of the contacts of a hand with so many fingers; `torsion` where it is given."""
+    """Return the torsion (m) of contacts where so many fingers touch; `torsion` where it is given."""
     return (TWO_FINGERS if fingers == 2 else 0.0) if torsion is None else torsion
 
 
@@ -33,8 +34,9 @@ class WrenchModel:
     friction: float = 0.5
     edges: int = 8
     """Of a friction cone, which is inscribed: epsilon grows with their number."""
-    torsion: float = 0.0
-    """Torque about the normal that unit normal force can hold, m; 0: hard finger, else soft finger."""
+    torsion: float | None = 0.0
+    """Torque about the normal that unit normal force can hold, m; 0: hard finger, else soft finger. None: `TWO_FINGERS`
+    where two fingers touch, else 0."""
     hull: Literal["l1", "linf"] = "l1"
     """Normal forces that sum up to 1 (hull of all wrenches), or of up to 1 each (Minkowski sum over contacts)."""
 
@@ -43,7 +45,7 @@ class WrenchModel:
         object.__setattr__(self, "origin", origin)
         object.__setattr__(self, "scale", float(self.scale))
         sound = len(origin) == 3 and np.isfinite(origin).all() and 0 < self.scale < np.inf and self.hull in HULLS
-        if not (sound and self.friction >= 0 and self.torsion >= 0 and self.edges >= 3):
+        if not (sound and self.friction >= 0 and (self.torsion or 0) >= 0 and self.edges >= 3):
             raise DexgraspError(
                 f"origin of 3 numbers, scale > 0, friction >= 0, torsion >= 0, edges >= 3, hull one of {HULLS}",
                 str(asdict(self)),
@@ -61,30 +63,62 @@ class WrenchModel:
 
     @property
     def per_contact(self) -> int:
-        """Wrenches of one contact."""
-        return len(cone_edges(self.edges, self.torsion > 0))
+        """Wrenches of one contact; of hard ones where `torsion` is None."""
+        return len(cone_edges(self.edges, (self.torsion or 0) > 0))
 
     def wrenches(self, contacts: Array, normals: Array) -> Array:
-        """Return wrenches (N, F * per_contact, 6) of contacts (N, F, 3), m, with outward unit normals (N, F, 3)."""
+        """Return wrenches (N, F * P, 6) of contacts (N, F, 3), m, with outward unit normals (N, F, 3).
+
+        All of them touch, else `torsion` is to be told; those of a contact of NaN are zero.
+        """
+        torsion = torsion_of(contacts.shape[1], self.torsion)
         return quality.wrenches(
-            contacts, normals, np.array(self.origin), self.scale, self.friction, self.edges, self.torsion
+            contacts, normals, np.array(self.origin), self.scale, self.friction, self.edges, torsion
         )
 
     def epsilon(self, contacts: Array, normals: Array, threshold: float | None = None) -> "Quality":
-        """Return exact epsilon (N,) with this model; below a threshold it may be told as 0, which is faster."""
-        found = quality.epsilon(self.wrenches(contacts, normals), threshold, self._summed(contacts))
-        return Quality(found, self, "epsilon", threshold)
+        """Return exact epsilon (N,) with this model; below a threshold it may be told as 0, which is faster.
+
+        Here and below, contacts of NaN are of fingers that do not touch, and the figure is of the others alone.
+        """
+
+        def figure(points: Array, outward: Array) -> Array:
+            return quality.epsilon(self.wrenches(points, outward), threshold, self._summed(points))
+
+        return Quality(_by_number(figure, contacts, normals), self, "epsilon", threshold)
 
     def reaches(self, contacts: Array, normals: Array, threshold: float) -> Array:
         """Return whether epsilon >= threshold (N,): the fastest filter."""
-        return quality.reaches(self.wrenches(contacts, normals), threshold, self._summed(contacts))
+
+        def figure(points: Array, outward: Array) -> Array:
+            return quality.reaches(self.wrenches(points, outward), threshold, self._summed(points))
+
+        return _by_number(figure, contacts, normals) > 0
 
     def volume(self, contacts: Array, normals: Array) -> "Quality":
         """Return the volume (N,) of the wrench hull with this model."""
-        return Quality(quality.volume(self.wrenches(contacts, normals), self._summed(contacts)), self, "volume")
+
+        def figure(points: Array, outward: Array) -> Array:
+            return quality.volume(self.wrenches(points, outward), self._summed(points))
+
+        return Quality(_by_number(figure, contacts, normals), self, "volume")
 
     def _summed(self, contacts: Array) -> int:
         return contacts.shape[1] if self.hull == "linf" else 0
+
+
+def _by_number(figure: Callable[[Array, Array], Array], contacts: Array, normals: Array) -> Array:
+    """Return a figure (N,) of the contacts (N, F, 3) that are not NaN, all grasps with equally many at once."""
+    touched = ~(torch.as_tensor(contacts) + torch.as_tensor(normals)).isnan().any(dim=-1).cpu().numpy()
+    if touched.all():
+        return figure(contacts, normals)
+    first, number = np.argsort(~touched, axis=1, kind="stable"), touched.sum(axis=1)
+    result = np.zeros(len(contacts))
+    for size in np.unique(number[number > 0]).tolist():
+        rows = np.flatnonzero(number == size)
+        chosen = rows[:, None], first[rows, :size]
+        result[rows] = torch.as_tensor(figure(contacts[chosen], normals[chosen])).cpu().numpy()
+    return result if isinstance(contacts, np.ndarray) else torch.from_numpy(result).to(contacts)
 
 
 @dataclass(frozen=True, eq=False)
