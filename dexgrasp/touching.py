@@ -19,11 +19,15 @@ def finger_sets(hand: Hand, least: int | None = None, most: int | None = None) -
     """Return the sets of fingers, from `least` (None: the hand's own) to `most` (None: all), that can grasp.
 
     All fingers come first. A `least` of more than the hand has is all of them. Raises DexgraspError where no set is
-    left.
+    left, or where `least` is less than the hand's own.
     """
     count = len(hand.fingers)
-    low = min(hand.least_fingers if least is None else least, count)
-    high = count if most is None else most
+    own = min(hand.least_fingers, count)
+    low, high = own if least is None else min(least, count), count if most is None else most
+    if low < own:
+        raise DexgraspError(
+            f"least_fingers of {own} or more for {hand.name!r}", str(least), f"let the hand: hand.least_fingers={least}"
+        )
     groups = closing_groups(hand)
     rows = [[flags[group] for group in groups] for flags in product((True, False), repeat=max(groups) + 1)]
     sets = torch.tensor(rows)

@@ -15,12 +15,14 @@ from dexgrasp.errors import DexgraspError
 Array = Tensor | np.ndarray
 HULLS = ("l1", "linf")
 TWO_FINGERS = 0.02
-"""Torsion where two fingers touch, m: hard contacts hold no torque about the line through them. As in `lift-v1`."""
+"""Torsion of a hand that grasps with two fingers, m: hard contacts hold no torque about the line through them. As in
+`lift-v1`. Its grasps with more fingers have it, too: else two soft fingers would seem better than four hard ones.
+"""
 
 
-def torsion_of(fingers: int, torsion: float | None) -> float:
-    """Return the torsion (m) of contacts where so many fingers touch; `torsion` where it is given."""
-    return (TWO_FINGERS if fingers == 2 else 0.0) if torsion is None else torsion
+def torsion_of(least: int, torsion: float | None) -> float:
+    """Return the torsion (m) of a hand of which at least so many fingers touch; `torsion` where it is given."""
+    return (TWO_FINGERS if least == 2 else 0.0) if torsion is None else torsion
 
 
 @dataclass(frozen=True)
@@ -34,9 +36,8 @@ class WrenchModel:
     friction: float = 0.5
     edges: int = 8
     """Of a friction cone, which is inscribed: epsilon grows with their number."""
-    torsion: float | None = 0.0
-    """Torque about the normal that unit normal force can hold, m; 0: hard finger, else soft finger. None: `TWO_FINGERS`
-    where two fingers touch, else 0."""
+    torsion: float = 0.0
+    """Torque about the normal that unit normal force can hold, m; 0: hard finger, else soft finger."""
     hull: Literal["l1", "linf"] = "l1"
     """Normal forces that sum up to 1 (hull of all wrenches), or of up to 1 each (Minkowski sum over contacts)."""
 
@@ -45,7 +46,7 @@ class WrenchModel:
         object.__setattr__(self, "origin", origin)
         object.__setattr__(self, "scale", float(self.scale))
         sound = len(origin) == 3 and np.isfinite(origin).all() and 0 < self.scale < np.inf and self.hull in HULLS
-        if not (sound and self.friction >= 0 and (self.torsion or 0) >= 0 and self.edges >= 3):
+        if not (sound and self.friction >= 0 and self.torsion >= 0 and self.edges >= 3):
             raise DexgraspError(
                 f"origin of 3 numbers, scale > 0, friction >= 0, torsion >= 0, edges >= 3, hull one of {HULLS}",
                 str(asdict(self)),
@@ -63,17 +64,13 @@ class WrenchModel:
 
     @property
     def per_contact(self) -> int:
-        """Wrenches of one contact; of hard ones where `torsion` is None."""
-        return len(cone_edges(self.edges, (self.torsion or 0) > 0))
+        """Wrenches of one contact."""
+        return len(cone_edges(self.edges, self.torsion > 0))
 
     def wrenches(self, contacts: Array, normals: Array) -> Array:
-        """Return wrenches (N, F * P, 6) of contacts (N, F, 3), m, with outward unit normals (N, F, 3).
-
-        All of them touch, else `torsion` is to be told; those of a contact of NaN are zero.
-        """
-        torsion = torsion_of(contacts.shape[1], self.torsion)
+        """Return wrenches (N, F * per_contact, 6) of contacts (N, F, 3), m, with outward unit normals (N, F, 3)."""
         return quality.wrenches(
-            contacts, normals, np.array(self.origin), self.scale, self.friction, self.edges, torsion
+            contacts, normals, np.array(self.origin), self.scale, self.friction, self.edges, self.torsion
         )
 
     def epsilon(self, contacts: Array, normals: Array, threshold: float | None = None) -> "Quality":

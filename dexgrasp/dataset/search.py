@@ -23,7 +23,7 @@ from dexgrasp.headroom import headroom
 from dexgrasp.objects import Object
 from dexgrasp.preview import BURIED, MISSED, SEEN, Preview
 from dexgrasp.touching import closing_groups, finger_sets
-from dexgrasp.wrench_model import WrenchModel
+from dexgrasp.wrench_model import WrenchModel, torsion_of
 
 PASS = 1.0
 """Hands are closed whose preview promises this much of the wanted epsilon: closing is dear, and seldom finds more."""
@@ -56,7 +56,8 @@ class Search:
         self.hand, self.item, self.surface, self.settings = hand, item, surface, settings
         self.body, self.shape, self.preview = hand_body(hand), HandShape(hand), Preview(hand)
         self.centring = Centring(hand)
-        self.model = WrenchModel(tuple(item.com), item.radius, settings.friction, settings.edges, settings.torsion)
+        torsion = torsion_of(hand.least_fingers, settings.torsion)
+        self.model = WrenchModel(tuple(item.com), item.radius, settings.friction, settings.edges, torsion)
         share, sets = settings.approach, finger_sets(hand, settings.least_fingers, settings.most_fingers)
         self.least = int(sets.sum(dim=1).min())
         groups = np.array(closing_groups(hand))
@@ -145,6 +146,9 @@ class Search:
             if further:
                 # Regions alike, however many grasps they hold: the search spreads to where there are few.
                 weight = 1.0 / np.bincount(region[own])[region[own]]
+                number = parents.touching[own].sum(dim=1).numpy()
+                if np.ptp(number):  # and numbers of fingers alike
+                    weight /= np.bincount(number, weights=weight)[number]
                 chosen = own[rng.choice(len(own), size=further, p=weight / weight.sum())]
                 drawn.append(proposer.vary(self.surface, parents[torch.from_numpy(chosen)], self.step, rng))
         return Draws.cat(drawn)
@@ -181,7 +185,8 @@ class Search:
         self.rejected["under the table"] += int((~free).sum())
         seen, quality = seen[free], quality[free]
         if self.few:
-            self._promise(drawn[torch.from_numpy(seen)], torch.from_numpy(quality))
+            promising = drawn[torch.from_numpy(seen)].replace(touching=_touched(touches[seen]))
+            self._promise(promising, torch.from_numpy(quality))
             self.rejected["quality"] += int((quality < PASS * settings.epsilon).sum())
             seen = seen[quality >= PASS * settings.epsilon]
         return torch.from_numpy(seen), _touched(touches[seen])
@@ -235,7 +240,7 @@ class Search:
         self.rejected["way is blocked"] += int((~folded & ~clear).sum())
         self.rejected["under the table"] += int((~folded & clear & ~fine).sum())
         self.valid += int(fine.sum())
-        self._keep(grasps[fine], drawn[good][fine], free[fine])
+        self._keep(grasps[fine], drawn[good][fine].replace(touching=grasps.touching[fine]), free[fine])
 
     def _out_of_the_way(self, grasps: Grasps) -> Bool[Tensor, "N"]:
         """Return which grasps' fingers that do not touch are clear of the object."""
@@ -279,8 +284,16 @@ class Search:
         self.grasps, self.draws, self.free = both[first], draws[first], torch.cat([self.free, free])[first]
 
     def chosen(self) -> Grasps:
-        """Return the target's number of grasps, best spread: first what each resting pose is to have."""
+        """Return the target's number of grasps, best spread: first what each resting pose is to have.
+
+        Of every number of fingers as far as there are so many, and of k of them k^2 parts: more fingers hold better.
+        """
         order = spread(self.grasps)
+        number = self.grasps.touching[order].sum(dim=1)
+        turn = torch.zeros(len(order), dtype=torch.float64)
+        for each in number.unique().tolist():
+            turn[number == each] = torch.arange(int((number == each).sum())).double() / each**2
+        order = order[turn.argsort(stable=True)]
         rank = self.free[order].cumsum(dim=0)
         serves = (self.free[order] & (rank <= self.wanted)).any(dim=1)
         chosen = torch.cat([serves.nonzero().flatten(), (~serves).nonzero().flatten()])

@@ -14,7 +14,7 @@ from dexgrasp.distance import DistanceField
 from dexgrasp.execution import opened
 from dexgrasp.geometry import inverse, rotation_angle
 from dexgrasp.grasps import Grasps
-from dexgrasp.wrench_model import WrenchModel
+from dexgrasp.wrench_model import WrenchModel, torsion_of
 
 if TYPE_CHECKING:
     from dexgrasp.closing import Closer, Closure
@@ -136,7 +136,8 @@ class Truth:
 
     def _model(self, body: Body) -> WrenchModel:
         limits = self.settings
-        return WrenchModel(tuple(body.com), body.radius, limits.friction, limits.edges, limits.torsion)
+        torsion = torsion_of(self.closer.hand.least_fingers, limits.torsion)
+        return WrenchModel(tuple(body.com), body.radius, limits.friction, limits.edges, torsion)
 
     def _closed_quality(self, grasps: Grasps, index: int) -> Float[Tensor, "N"]:
         """Return epsilon of grasps of one object after closing again; 0 where a check fails."""
