@@ -29,6 +29,7 @@ from dexgrasp.settings import read
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.statistics import bootstrap_ratio
+from dexgrasp.touching import fewest_fingers
 from dexgrasp.wrench_model import WrenchModel, torsion_of
 
 
@@ -93,7 +94,7 @@ class Campaign:
         start = opened(dataset.hand, grasp.joints.double(), self.protocol.motion.opening, touching)
         base = inverse(pose.double()) @ grasp.pose.double()
         closure = dataset.closer.close(field, base, start, centred=True, touching=touching)
-        torsion = torsion_of(dataset.hand.least_fingers, synthesis.get("torsion"))
+        torsion = torsion_of(fewest_fingers(dataset.hand), synthesis.get("torsion"))
         model = WrenchModel(tuple(item.com), item.radius, synthesis["friction"], synthesis["edges"], torsion)
         return float(model.epsilon(closure.contacts, closure.normals).values[0])
 

@@ -41,6 +41,11 @@ def finger_sets(hand: Hand, least: int | None = None, most: int | None = None) -
     return sets
 
 
+def fewest_fingers(hand: Hand) -> int:
+    """Return the size of the smallest set of fingers that can grasp."""
+    return int(finger_sets(hand).sum(dim=1).min())
+
+
 def closing_groups(hand: Hand) -> list[int]:
     """Return, per finger, the number of its group: fingers that share a closing joint, directly or by others'."""
     groups = list(range(len(hand.fingers)))

@@ -1,6 +1,5 @@
 """The search for grasps of one object: draws near what is known to be good, and some from nothing."""
 
-import copy
 from collections import Counter
 
 import numpy as np
@@ -11,6 +10,7 @@ from torch import Tensor
 from dexgrasp.centring import Centring
 from dexgrasp.closing import CLOSED, MISSES, OFF_TIP, PENETRATES
 from dexgrasp.collision import HandShape, as_arrays
+from dexgrasp.dataset.open_fingers import OpenFingers
 from dexgrasp.dataset.proposals import Approach, Contact, Draws
 from dexgrasp.dataset.spread import distinct, regions, spread
 from dexgrasp.dataset.surface import Surface
@@ -22,7 +22,7 @@ from dexgrasp.hand_body import hand_body
 from dexgrasp.headroom import headroom
 from dexgrasp.objects import Object
 from dexgrasp.preview import BURIED, MISSED, SEEN, Preview
-from dexgrasp.touching import closing_groups, finger_sets
+from dexgrasp.touching import closing_groups, fewest_fingers, finger_sets
 from dexgrasp.wrench_model import WrenchModel, torsion_of
 
 PASS = 1.0
@@ -39,8 +39,6 @@ NEW = 0.5
 """They grow, too, where less of the valid ones than this is new."""
 SHORTEST, LONGEST = 0.3, 1.5
 """within these bounds."""
-CLEAR = 5e-4
-"""Fingers that do not touch stay this far from the object, m: the balls that follow their surface err by less."""
 ROLLING = 32
 """At most so many resting poses of an object are looked at: what rolls has many, none of them likely."""
 ABOUT, ALIKE = 2e-3, 0.5
@@ -56,15 +54,14 @@ class Search:
         self.hand, self.item, self.surface, self.settings = hand, item, surface, settings
         self.body, self.shape, self.preview = hand_body(hand), HandShape(hand), Preview(hand)
         self.centring = Centring(hand)
-        torsion = torsion_of(hand.least_fingers, settings.torsion)
+        torsion = torsion_of(fewest_fingers(hand), settings.torsion)
         self.model = WrenchModel(tuple(item.com), item.radius, settings.friction, settings.edges, torsion)
         share, sets = settings.approach, finger_sets(hand, settings.least_fingers, settings.most_fingers)
         self.least = int(sets.sum(dim=1).min())
         groups = np.array(closing_groups(hand))
         self.joined = [np.flatnonzero(groups == group) for group in range(groups.max() + 1)]
         """Fingers that share a closing joint."""
-        self.fingers = [_only(self.shape, finger) for finger in range(len(groups))]
-        """The links that closing a finger moves."""
+        self.open_fingers = OpenFingers(self.shape)
         self.proposers = [
             (palm, proposer, part)
             for palm, proposer, part in ((False, Contact(hand, sets), 1 - share), (True, Approach(hand, sets), share))
@@ -234,23 +231,13 @@ class Search:
         folded = self.shape.self_collision(grasps.joints) | self.shape.self_collision(waiting)
         clear = self.shape.approach_clear(self.surface.field, grasps.pose, waiting, settings.retreat, settings.overlap)
         free = self._above_table(grasps.pose, [grasps.joints, waiting])
-        clear &= self._out_of_the_way(grasps)
+        clear &= self.open_fingers.clear(self.surface.field, grasps)
         fine = ~folded & clear & free.any(dim=1)
         self.rejected["hand touches itself"] += int(folded.sum())
         self.rejected["way is blocked"] += int((~folded & ~clear).sum())
         self.rejected["under the table"] += int((~folded & clear & ~fine).sum())
         self.valid += int(fine.sum())
         self._keep(grasps[fine], drawn[good][fine].replace(touching=grasps.touching[fine]), free[fine])
-
-    def _out_of_the_way(self, grasps: Grasps) -> Bool[Tensor, "N"]:
-        """Return which grasps' fingers that do not touch are clear of the object."""
-        clear = torch.ones(len(grasps), dtype=torch.bool)
-        for number, shape in enumerate(self.fingers):
-            rows = (~grasps.touching[:, number]).nonzero().flatten()
-            if len(rows):
-                own = grasps[rows]
-                clear[rows] &= shape.approach_clear(self.surface.field, own.pose, own.joints, 0.0, -CLEAR)
-        return clear
 
     def _above_table(
         self,
@@ -310,18 +297,6 @@ class Search:
 
 def _touched(touches: Float[np.ndarray, "N F 6"]) -> Bool[Tensor, "N F"]:
     return torch.from_numpy(np.isfinite(touches[..., 0]))
-
-
-def _only(shape: HandShape, finger: int) -> HandShape:
-    """Return a shape that has but the links which closing one finger moves."""
-    body = shape.body
-    rate = body.coupling @ body.rates[finger]
-    moved = np.zeros(len(body.roots), bool)
-    for link, (parent, drive) in enumerate(zip(body.parents, body.drives, strict=True)):
-        moved[link] = (parent >= 0 and moved[parent]) or (drive >= 0 and rate[drive] != 0)
-    alone = copy.copy(shape)
-    alone.body = body._replace(roots=np.where(moved, body.roots, -1))
-    return alone
 
 
 def _resting(item: Object, share: float | None) -> tuple[Float[Tensor, "K 4 4"], Float[Tensor, "K"]]:

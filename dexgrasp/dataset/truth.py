@@ -14,6 +14,7 @@ from dexgrasp.distance import DistanceField
 from dexgrasp.execution import opened
 from dexgrasp.geometry import inverse, rotation_angle
 from dexgrasp.grasps import Grasps
+from dexgrasp.touching import fewest_fingers
 from dexgrasp.wrench_model import WrenchModel, torsion_of
 
 if TYPE_CHECKING:
@@ -136,7 +137,7 @@ class Truth:
 
     def _model(self, body: Body) -> WrenchModel:
         limits = self.settings
-        torsion = torsion_of(self.closer.hand.least_fingers, limits.torsion)
+        torsion = torsion_of(fewest_fingers(self.closer.hand), limits.torsion)
         return WrenchModel(tuple(body.com), body.radius, limits.friction, limits.edges, torsion)
 
     def _closed_quality(self, grasps: Grasps, index: int) -> Float[Tensor, "N"]:

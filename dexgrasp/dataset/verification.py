@@ -15,6 +15,7 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.execution import opened
 from dexgrasp.grasps import Grasps
 from dexgrasp.seeds import stream
+from dexgrasp.touching import fewest_fingers
 from dexgrasp.wrench_model import WrenchModel, torsion_of
 
 SCHEMAS: dict[str, dict[str, tuple[str | int, ...]]] = {
@@ -95,7 +96,7 @@ def rechecked(dataset: Dataset, grasps: int, scenes: int, seed: int = 0) -> Iter
 
 def _grasps(dataset: Dataset, count: int, seed: int) -> Iterator[Check]:
     settings = stages.settings_of(dataset).synthesis
-    torsion = torsion_of(dataset.hand.least_fingers, settings.torsion)
+    torsion = torsion_of(fewest_fingers(dataset.hand), settings.torsion)
     kept = np.array([len(dataset.grasps(i)) for i in range(len(dataset.store("grasps")))])
     if not kept.sum():
         yield Check("grasps", True, "none are there")
