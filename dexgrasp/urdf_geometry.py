@@ -4,6 +4,7 @@ import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
@@ -39,10 +40,10 @@ def link_meshes(robot: ElementTree.Element, tag: str, urdf: Path) -> dict[str, l
     return meshes
 
 
-def convex_pieces(mesh: trimesh.Trimesh, link: str) -> tuple[trimesh.Trimesh, ...]:
+def convex_pieces(mesh: trimesh.Trimesh, link: str, seconds: int | None = None) -> tuple[trimesh.Trimesh, ...]:
     """Return a collision mesh as convex parts: itself, its hull where that is as good, else a decomposition (cached).
 
-    A hull is as good where it stands nowhere more than `DENT` off the mesh.
+    A hull is as good where it stands nowhere more than `DENT` off the mesh. `seconds` as in `convex_parts`.
     """
     if mesh.is_convex:
         return (mesh,)
@@ -53,7 +54,7 @@ def convex_pieces(mesh: trimesh.Trimesh, link: str) -> tuple[trimesh.Trimesh, ..
         return (hull,)
     mesh = mesh.copy()
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    parts = convex_parts(mesh, DEPTH)
+    parts = convex_parts(mesh, DEPTH, seconds)
     logger.info("link %s: its hull would stand %.1f mm off the mesh; %d convex parts", link, 1e3 * dent, len(parts))
     return parts
 
@@ -131,8 +132,13 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
     """Return the file of a mesh name: relative, absolute, file:// or package://; None if there is none.
 
     `package://name/rest` is looked up as `name/rest` and as `rest` in every folder above the URDF and in those
-    of ROS_PACKAGE_PATH.
+    of ROS_PACKAGE_PATH; `%20` and the like as what they stand for, where there is no such file.
     """
+    plain = unquote(name)
+    return _find(name, urdf) or (_find(plain, urdf) if plain != name else None)
+
+
+def _find(name: str, urdf: Path) -> Path | None:
     if name.startswith("package://"):
         rest = name.removeprefix("package://")
         inside = rest.partition("/")[2]

@@ -21,6 +21,8 @@ BESIDE = 0.006
 """A round tip that goes over into a flat side touches that at its end, or so far beside it, m."""
 NEAR = 0.015
 """The pad begins this near to where the fitted circle would touch, m."""
+AWAY = 0.016
+"""It is not so far from the fitted circle, m."""
 PAD = 0.008
 """Largest circle in a flat pad, and how far from its end it touches, m."""
 REACH = 0.03
@@ -98,7 +100,7 @@ def _on_pad(
     along = np.cross(across, axis)
     # The part that holds the circle's middle: a hull over several would have sides that nothing has.
     depths = [float((side[:, :3] @ center - side[:, 3]).max()) for side in map(planes, parts)]
-    parts = parts[int(np.argmin(depths)) :][:1] if depths else ()
+    every, parts = parts, parts[int(np.argmin(depths)) :][:1] if depths else ()
     cuts = [trimesh.intersections.mesh_plane(part, axis, center + 1e-7 * axis).reshape(-1, 3) for part in parts]
     points = np.vstack([np.zeros((0, 3)), *cuts]) - center
     if len(points) < 4:
@@ -132,6 +134,10 @@ def _on_pad(
         return None  # a round tip: its circle is as thick as the finger
     new = min(PAD, thick / 2)
     middle = stop + min(PAD, length[side] / 2) * way - new * normal
+    touch = center + (middle[0] + new * normal[0]) * along + (middle[1] + new * normal[1]) * across
+    buried = min(float((each[:, :3] @ touch - each[:, 3]).max()) for each in map(planes, every)) < -TOUCHING
+    if buried or np.linalg.norm(middle) > AWAY:
+        return None  # a seam between parts, or the side of a finger with a round end
     return center + middle[0] * along + middle[1] * across, new
 
 
