@@ -40,10 +40,13 @@ def link_meshes(robot: ElementTree.Element, tag: str, urdf: Path) -> dict[str, l
     return meshes
 
 
-def convex_pieces(mesh: trimesh.Trimesh, link: str, seconds: int | None = None) -> tuple[trimesh.Trimesh, ...]:
+def convex_pieces(
+    mesh: trimesh.Trimesh, link: str, depth: float = DEPTH, seconds: int | None = None
+) -> tuple[trimesh.Trimesh, ...]:
     """Return a collision mesh as convex parts: itself, its hull where that is as good, else a decomposition (cached).
 
-    A hull is as good where it stands nowhere more than `DENT` off the mesh. `seconds` as in `convex_parts`.
+    A hull is as good where it stands nowhere more than `DENT` off the mesh. `depth` and `seconds` are `convex_parts`'
+    threshold and time.
     """
     if mesh.is_convex:
         return (mesh,)
@@ -54,7 +57,7 @@ def convex_pieces(mesh: trimesh.Trimesh, link: str, seconds: int | None = None) 
         return (hull,)
     mesh = mesh.copy()
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    parts = convex_parts(mesh, DEPTH, seconds)
+    parts = convex_parts(mesh, depth, seconds)
     logger.info("link %s: its hull would stand %.1f mm off the mesh; %d convex parts", link, 1e3 * dent, len(parts))
     return parts
 

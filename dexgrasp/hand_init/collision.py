@@ -15,7 +15,7 @@ from dexgrasp.hand_init.model import Link, Model
 from dexgrasp.progress import track
 from dexgrasp.repair import halved, lightened
 from dexgrasp.shapes.solid import fibonacci
-from dexgrasp.urdf_geometry import convex_pieces, joined
+from dexgrasp.urdf_geometry import DEPTH, convex_pieces, joined
 
 FAR, FAR_TIP = 0.004, 0.002
 """Given collision shapes that are farther (95 %) from the visual ones are made anew, m; on distal links."""
@@ -25,7 +25,7 @@ MOST, COARSE = 12, 0.016
 """A link of more parts is cut less finely: slower for nothing; twice the depth of dents that may be filled, m."""
 FACES, CUT = 20000, 3000
 """A mesh of more faces is simplified before it is written, and before it is cut."""
-SECONDS, PIECES = 60, 6
+SECONDS, PIECES = 30, 6
 """Processor time that cutting a mesh may take; where that is not enough, hulls of so many slices stand for it."""
 log = logging.getLogger(__name__)
 
@@ -135,10 +135,11 @@ def _parts(
 
 def _cut(mesh: trimesh.Trimesh, link: str) -> tuple[tuple[trimesh.Trimesh, ...], str]:
     """Return a mesh as not too many convex parts, and what was in the way."""
-    # An open mesh is closed by voxels first, whose time grows with the faces.
+    # An open mesh is closed by voxels first, whose time grows with the faces, and whose steps are no dents.
     mesh = lightened(mesh, CUT)
+    depth = DEPTH if mesh.is_watertight else 2 * DEPTH
     try:
-        parts = tuple(_few_corners(part) for part in convex_pieces(mesh, link, SECONDS))
+        parts = tuple(_few_corners(part) for part in convex_pieces(mesh, link, depth, SECONDS))
         return (parts if len(parts) <= MOST else convex_parts(mesh, COARSE, SECONDS)), ""
     except Slow:
         reason = f"could not be cut into convex parts within {SECONDS} s"
