@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import unquote
@@ -115,10 +116,9 @@ def _mesh(shape: ElementTree.Element, urdf: Path, link: str) -> trimesh.Trimesh:
             "copy it there, or correct the file name in the URDF (relative names count from the URDF's folder)",
         )
     try:
-        mesh = trimesh.load_mesh(path)
+        mesh = load_file(path)
     except Exception as error:
         raise DexgraspError(f"a readable mesh for link {link!r}", f"{path}: {error}", "export it again") from error
-    mesh = mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise DexgraspError(f"a mesh with faces for link {link!r}", f"none in {path}", "export it again")
     mesh.apply_scale(numbers(shape, "scale", "1 1 1"))
@@ -128,6 +128,18 @@ def _mesh(shape: ElementTree.Element, urdf: Path, link: str) -> trimesh.Trimesh:
             f"extents of {np.array2string(mesh.extents, precision=4)} m in {path}",
             'it is probably in millimetres: scale it, or write scale="0.001 0.001 0.001" in the URDF',
         )
+    return mesh
+
+
+def load_file(path: Path) -> trimesh.Geometry:
+    """Return what a mesh file holds as one mesh; COLLADA's unit counts, as robots' viewers have it."""
+    mesh = trimesh.load_mesh(path)
+    mesh = mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh
+    if path.suffix.lower() == ".dae":
+        with path.open("rb") as file:
+            unit = re.search(rb'<unit\b[^>]*\bmeter\s*=\s*"([^"]+)"', file.read(1 << 16))
+        if unit and float(unit[1]) != 1.0:
+            mesh.apply_scale(float(unit[1]))
     return mesh
 
 

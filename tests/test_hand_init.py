@@ -312,6 +312,10 @@ def test_meshes_of_all_forms_mirrored_and_with_escaped_names(tmp_path, form):
     pads.mkdir()
     trimesh.creation.capsule(radius=10, height=20).export(pads / f"tip.{form}")
     scale = 'scale="-0.001 0.001 0.001"'
+    if form == "dae":  # its own unit counts: centimetres, of which the scale makes metres
+        collada = (pads / "tip.dae").read_text()
+        (pads / "tip.dae").write_text(collada.replace("<up_axis>", '<unit name="cm" meter="0.01"/><up_axis>'))
+        scale = 'scale="-0.1 0.1 0.1"'
     text = write(tmp_path, PALM, *claw()).read_text()
     text = text.replace('<sphere radius="0.01"/>', f'<mesh filename="file://{tmp_path}/my%20pads/tip.{form}" {scale}/>')
     path = tmp_path / "hand.urdf"

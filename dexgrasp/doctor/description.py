@@ -15,7 +15,7 @@ import trimesh
 from dexgrasp import plugins
 from dexgrasp.errors import DexgraspError
 from dexgrasp.urdf_file import read_robot
-from dexgrasp.urdf_geometry import find_mesh
+from dexgrasp.urdf_geometry import find_mesh, load_file
 
 log = logging.getLogger(__name__)
 PLACES = ("*.yaml", "hand/*.yaml", "conf/hand/*.yaml", "*/conf/hand/*.yaml")
@@ -125,10 +125,9 @@ class Description:
 
 def _read(path: Path) -> trimesh.Trimesh | str:
     try:
-        mesh = trimesh.load_mesh(path)
+        mesh = load_file(path)
     except Exception as error:  # each format's reader has its own exceptions
         return f"unreadable ({type(error).__name__}: {error})"
-    mesh = mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         return "empty: no faces"
     return mesh if np.isfinite(mesh.vertices).all() else "broken: vertices that are no numbers"
