@@ -197,6 +197,18 @@ def test_a_fixed_fingertip_is_the_distal_link_and_a_pulley_is_no_finger(tmp_path
     assert any("motor is no finger" in guess.text for guess in written.guesses.made)
 
 
+def test_joints_that_move_no_finger_are_fixed_and_inertias_of_other_bodies_mended(tmp_path):
+    limit = '<limit lower="0.5" upper="9" effort="1" velocity="1"/>'
+    wheels = [link("wheel", at="0 0 0"), joint("wheel", "palm", "wheel", "0 0 -0.05", limit=limit)]
+    wheels += [link("cog", at="0 0 0"), joint("cog", "palm", "cog", "0.02 0 -0.05", extra='<mimic joint="wheel"/>')]
+    path = write(tmp_path, PALM, *claw(), *wheels)
+    path.write_text(path.read_text().replace(INERTIAL, INERTIAL.replace('"2e-5"', '"2e-2"'), 2))
+    written, hand = made(path, tmp_path)
+    assert hand.joint_names == ("near_0", "near_1", "near_2") and "wheel" in hand.link_names
+    assert any("moves no finger" in guess.text for guess in written.guesses.about("joints"))
+    assert any("which no body has" in guess.text for guess in written.guesses.about("inertias"))
+
+
 def test_couplings_are_mended_where_that_is_plain(tmp_path):
     """A name without its prefix; a chain of couplings; a follower whose own limits end the motion."""
     text = write(tmp_path, PALM, *claw()).read_text()
