@@ -3,11 +3,16 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import torch
 import trimesh
 from jaxtyping import Float
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from dexgrasp.synergies import Synergy
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +64,8 @@ class Hand(ABC):
     efforts: Float[Tensor, "J"]
     """Torque (N m) or force (N) limit of each independent joint, at that joint."""
     fingers: tuple[Finger, ...]
+    least_fingers: int = 2
+    """Fewest fingers that touch in a grasp, where nothing else is asked for; a hand with fewer uses all."""
     link_names: tuple[str, ...]
     base_T_palm: Float[Tensor, "4 4"]
     """Palm frame: origin on the palm's face, z = approach direction (towards the object)."""
@@ -66,6 +73,8 @@ class Hand(ABC):
     """Mesh of each link that has one, link coordinates."""
     collisions: Mapping[str, tuple[trimesh.Trimesh, ...]]
     """Convex parts of each link that has some, link coordinates."""
+    synergies: "Mapping[str, Synergy]" = MappingProxyType({})
+    """By name: what postures are drawn from in synthesis; empty: every joint by itself."""
 
     @abstractmethod
     def link_poses(self, joints: Float[Tensor, "N J"]) -> dict[str, Float[Tensor, "N 4 4"]]:

@@ -15,6 +15,7 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.fingertip import fit_fingertip
 from dexgrasp.hand import Finger, Hand
 from dexgrasp.kinematics import KinematicTree, LinkRecord
+from dexgrasp.synergies import Synergy
 from dexgrasp.urdf_file import UrdfFile
 from dexgrasp.urdf_geometry import convex_pieces, joined, link_meshes
 
@@ -38,6 +39,7 @@ class UrdfHand(Hand):
             its own axis), `tip_radius` and `tip_center` (default: fitted from the link's mesh), `closing_axis`,
             `outer_joint` (link coordinates).
         shared: independent joints that are main joints of every finger.
+        least_fingers: fewest fingers that touch in a grasp.
         root: link at which the hand begins, where the URDF holds a whole arm; the base frame is its frame.
         palm: a link whose frame is the palm frame, or {origin, approach} in the base frame.
         couplings: {joint: {joint, multiplier (1), offset (0)}}, in place of `<mimic>` tags that are wrong or missing;
@@ -48,6 +50,7 @@ class UrdfHand(Hand):
         collision: `given` (the URDF's `<collision>`) or `visual`; default: `given`, where the URDF has none at all
             `visual`. What is not convex is cut into convex parts (see `convex_pieces`).
         model: nothing but a key that the YAML's `urdf` may be composed from, where a hand comes in several models.
+        synergies: {name: synergy}, postures that synthesis draws from, see `dexgrasp.synergies.Synergy.read`.
 
     Raises:
         DexgraspError: a file, link, joint or number that is missing or wrong.
@@ -60,6 +63,7 @@ class UrdfHand(Hand):
         fingers: Sequence[Mapping[str, Any]],
         *,
         shared: Sequence[str] = (),
+        least_fingers: int = 2,
         root: str | None = None,
         palm: str | Mapping[str, Sequence[float]] | None = None,
         couplings: Mapping[str, Mapping[str, Any] | None] | None = None,
@@ -68,6 +72,7 @@ class UrdfHand(Hand):
         allowed_contacts: Sequence[Sequence[str]] = (),
         collision: str | None = None,
         model: str | None = None,
+        synergies: Mapping[str, Any] | None = None,
     ) -> None:
         self.name, self.urdf = name, Path(urdf)
         self.couplings = dict(couplings or {})
@@ -98,6 +103,12 @@ class UrdfHand(Hand):
         self.shared = tuple(joint for joint in self.joint_names if joint in shared)
         self.base_T_palm = self._palm(palm)
         self.fingers = tuple(self._finger(finger) for finger in fingers)
+        if not 2 <= least_fingers <= max(len(self.fingers), 2):
+            raise DexgraspError(
+                f"least_fingers of 2 to {len(self.fingers)}", repr(least_fingers), f"mend it in the YAML of {name!r}"
+            )
+        self.least_fingers = least_fingers
+        self.synergies = {name: Synergy.read(name, given, self) for name, given in (synergies or {}).items()}
 
     def link_poses(self, joints: Float[Tensor, "N J"]) -> dict[str, Float[Tensor, "N 4 4"]]:
         """Return base_T_link of every link; differentiable, dtype and device of `joints`."""
