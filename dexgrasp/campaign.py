@@ -60,7 +60,7 @@ class Campaign:
         episodes = [episode for episode, _ in done]
         results: dict[str, Any] = {
             "protocol": str(self.protocol),
-            "protocol_values": asdict(self.protocol),
+            "protocol_values": self.protocol.values(),
             "policy": asdict(self.policy),
             "selection": asdict(self.selection),
             "top_k": self.top_k,

@@ -44,7 +44,7 @@ class Settings:
             {str(key): value for key, value in options.items()},
             read(Policy, options["policy"], "evaluation.policy"),
             read(Selection, config.selection, "selection"),
-            load_protocol(OmegaConf.to_container(config.protocol)),  # type: ignore[arg-type]
+            load_protocol(OmegaConf.to_container(config.protocol)).on_table("a closed loop"),  # type: ignore[arg-type]
         )
 
 
