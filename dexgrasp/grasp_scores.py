@@ -26,7 +26,7 @@ from dexgrasp.progress import track
 from dexgrasp.seeds import stream
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import Protocol
-from dexgrasp.statistics import bootstrap_ratio, wilson
+from dexgrasp.statistics import rate_interval
 
 FLOATING = 1.0
 """Objects of protocols without a table float this high above it, m."""
@@ -113,20 +113,11 @@ def _work(scoring: Scoring, item: Object, grasps: Grasps) -> Scored:
 
 
 def summary(scored: Sequence[Scored], protocol: Protocol, seed: int) -> dict[str, Any]:
-    """Return SR under one protocol with its 95 % interval.
-
-    Grasps of one object depend on each other: bootstrap over objects. Wilson where each object has one grasp, where
-    there is one object (its grasps then stand for themselves), and, counting objects, where all end alike.
-    """
+    """Return SR under one protocol with its 95 % interval (`statistics.rate_interval` over objects)."""
     reasons = [each.judged[protocol.name].reasons for each in scored]
     tried = [each[each != UNTESTED] for each in reasons]
     wins, tries = [int((each == int(Reason.SUCCESS)).sum()) for each in tried], [len(each) for each in tried]
-    apart = sum(count > 0 for count in tries) < 2 or max(tries, default=0) == 1
-    kind = "wilson" if apart else "bootstrap"
-    interval = wilson(sum(wins), sum(tries)) if apart else bootstrap_ratio(wins, tries, seed)
-    if not apart and sum(wins) in (0, sum(tries)):  # nothing to draw from
-        met = sum(count > 0 for count in tries)
-        kind, interval = "wilson over objects", wilson(met if sum(wins) else 0, met)
+    interval, kind = rate_interval(wins, tries, seed)
     numbers, counts = torch.cat([*tried, torch.zeros(0, dtype=torch.long)]).unique(return_counts=True)
     told = {Reason(int(n)).name.lower(): int(count) for n, count in zip(numbers, counts, strict=True)}
     spent = sum(each.judged[protocol.name].seconds for each in scored)

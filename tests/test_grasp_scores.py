@@ -141,7 +141,7 @@ def test_intervals_by_what_depends_on_what():
     kinds = {
         "bootstrap": [[True, False], [True, True], [False, False]],
         "wilson": [[True], [False], [True]],
-        "wilson over objects": [[True, True], [True]],
+        "wilson over groups": [[True, True], [True]],
     }
     for kind, wins in kinds.items():
         entry = summary(scored(wins), rule, 0)["success_rate"]
