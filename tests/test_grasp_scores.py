@@ -10,6 +10,7 @@ import trimesh
 
 from dexgrasp import __main__ as cli
 from dexgrasp.collision import HandShape
+from dexgrasp.commands.score import _scaled
 from dexgrasp.dataset.verdicts import UNTESTED, VerifySettings
 from dexgrasp.distance import DistanceField
 from dexgrasp.errors import DexgraspError
@@ -17,6 +18,8 @@ from dexgrasp.fingerprint import objects_hash
 from dexgrasp.grasp_metrics import closed, diversity, grasp_metrics, self_penetration
 from dexgrasp.grasp_scores import Judged, Scored, judge, metric_table, summary
 from dexgrasp.grasps import Grasps, Reason
+from dexgrasp.interchange.binding import bind, unbound
+from dexgrasp.interchange.formats import read_grasps, write_grasps
 from dexgrasp.objects import Object
 from dexgrasp.simulation.protocol import load_protocol
 
@@ -166,6 +169,41 @@ def test_areas_are_signed_by_what_is_better():
 def test_same_objects_have_the_same_hash():
     assert objects_hash([box(), box(name="b")]) == objects_hash([box(name="b"), box()])
     assert objects_hash([box()]) != objects_hash([box(0.051)])
+
+
+def test_meshes_at_the_scales_of_a_file(tmp_path):
+    """DexGraspNet's meshes have no unit, and one mesh several sizes."""
+    trimesh.creation.box((1.0, 0.5, 0.5)).export(tmp_path / "mug.stl")
+    trimesh.creation.box((1.0, 1.0, 1.0)).export(tmp_path / "box.stl")
+    options = {"kind": "folder", "path": str(tmp_path), "scale": None, "include": "*"}
+    bodies = [("mug", 0.06), ("box", 0.05), ("mug", 0.12)]
+    found = list(_scaled(options, bodies))
+    assert [item.name for item in found] == ["mug x 0.06", "box", "mug x 0.12"]
+    for item, (_, scale) in zip(found, bodies, strict=True):
+        assert item.mesh.extents[0] == pytest.approx(scale) and item.mesh.is_watertight
+        parts = np.concatenate([part.vertices for part in item.parts])
+        assert np.ptp(parts, axis=0) == pytest.approx(item.mesh.extents, rel=0.02)
+    with pytest.raises(DexgraspError):
+        list(_scaled(options, [("mugg", 0.06)]))
+
+
+def test_a_file_says_the_same_as_the_dataset_it_comes_from(hand, shape, grasps, tmp_path):
+    """Through DexGraspBench's files, the verdicts stay."""
+    one = grasps.replace(object=torch.zeros(3, dtype=torch.long))
+    write_grasps(unbound(one, hand, ("box",) * 3), tmp_path / "bench", "dexgraspbench")
+    back = bind(read_grasps(tmp_path / "bench"), hand).grasps
+    rule = load_protocol("isaac-dro")
+    first, second = (judge(hand, shape, box(), each, rule, 0).reasons for each in (one, back))
+    assert torch.equal(first, second)
+
+
+def test_command_without_meshes_or_with_the_wrong_hand(hand, grasps, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    path = write_grasps(unbound(grasps, hand, ("box",) * 3), tmp_path / "g.safetensors", "dexgrasp")
+    assert cli.main(["eval", f"grasps={path}"]) == 2
+    assert "objects=folder" in capsys.readouterr().err
+    assert cli.main(["eval", f"grasps={path}", "hand=panda"]) == 2
+    assert "joints of panda" in capsys.readouterr().err
 
 
 def test_command_on_a_dataset(tiny, tmp_path, monkeypatch, capsys):

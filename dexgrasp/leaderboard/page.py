@@ -12,9 +12,10 @@ from dexgrasp.leaderboard.row import Interval, Row
 WIDTH = 900
 """Pictures are made no wider, pixels."""
 STYLE = (
-    "body{font:15px/1.5 system-ui,sans-serif;max-width:1250px;margin:2rem auto;padding:0 1rem;color:#222}"
+    "body{font:15px/1.5 system-ui,sans-serif;max-width:1500px;margin:2rem auto;padding:0 1rem;color:#222}"
     "table{border-collapse:collapse;margin:1rem 0;font-variant-numeric:tabular-nums}"
     "td,th{border-bottom:1px solid #ddd;padding:.3rem .7rem;text-align:left;vertical-align:top}"
+    "td:nth-child(n+4){white-space:nowrap}"
     "th{cursor:pointer;user-select:none;white-space:nowrap}th[aria-sort=ascending]::after{content:' \\25B2'}"
     "th[aria-sort=descending]::after{content:' \\25BC'}img{max-width:100%}code{font-size:.85em}"
     "pre{max-height:24rem;overflow:auto;background:#f6f6f6;padding:.6rem;font-size:12px}.note{color:#666}"

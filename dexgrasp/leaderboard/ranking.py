@@ -66,12 +66,13 @@ def draw_pareto(ranking: Ranking, path: Path) -> Path | None:
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     front = pareto(timed)
-    axes.plot([row.seconds for row in front], [100 * (row.success.value or 0) for row in front], color="0.7", zorder=1)
+    rates = [100 * (row.success.value or 0.0) for row in front]
+    axes.plot([row.seconds or 0.0 for row in front], rates, color="0.7", zorder=1)
     for row in timed:
         value = 100 * (row.success.value or 0.0)
         reach = [[max(value - 100 * row.success.low, 0.0)], [max(100 * row.success.high - value, 0.0)]]
         best = any(row is each for each in front)
-        axes.errorbar(row.seconds, value, yerr=reach, fmt="o", color="#2b6ca3" if best else "#9aa5b1", capsize=3)
+        axes.errorbar(row.seconds or 0.0, value, yerr=reach, fmt="o", color="#2b6ca3" if best else "#9aa5b1", capsize=3)
         number = 1 + next(place for place, each in enumerate(ranking.rows) if each is row)
         axes.annotate(str(number), (row.seconds or 0.0, value), xytext=(5, 4), textcoords="offset points", fontsize=8)
     axes.set_xscale("log")
