@@ -1,9 +1,12 @@
 """The command line: ``python -m dexgrasp <command> [overrides | arguments]``."""
 
 import os
+import signal
 import sys
+import threading
 from importlib import import_module
 from pathlib import Path
+from types import FrameType
 
 from dexgrasp.errors import DexgraspError, room
 
@@ -38,6 +41,8 @@ def main(argv: list[str] | None = None) -> int:
     """Run one command; return the exit status (2 for a user's error, 130 for Ctrl-C)."""
     argv = sys.argv[1:] if argv is None else argv
     command, rest = (argv[0], argv[1:]) if argv else ("--help", [])
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _interrupt)
     try:
         if command in ("-h", "--help", "help"):
             print(usage())
@@ -68,6 +73,12 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"\ndexgrasp {command}: interrupted", file=sys.stderr)
         return 130
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Do on SIGTERM, with which batch systems take a machine back, what Ctrl-C does now."""
+    handler = signal.getsignal(signal.SIGINT)
+    (handler if callable(handler) else signal.default_int_handler)(number, frame)
 
 
 def tool(command: str, arguments: list[str]) -> int:

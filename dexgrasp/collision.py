@@ -7,17 +7,17 @@ from numba import njit
 from torch import Tensor
 
 from dexgrasp.borrow import borrowed
+from dexgrasp.cloud_depth import cloud_depths
 from dexgrasp.distance import DistanceField, Field, quick_bound, seed_at
 from dexgrasp.hand import Hand
 from dexgrasp.hand_body import HandBody, carry, hand_body, place_links
+from dexgrasp.self_collision import self_collisions
 from dexgrasp.triangle_tree import nearest
 
 FAR = 3e-3
 """Of distances from a ball to the surface above this the grid's quickest bound will do, m."""
 CORES = 6
 """Balls of each link that are tried first."""
-SELF_OVERLAP = 5e-4
-"""Links that overlap by more than this collide, m."""
 
 
 class HandShape:
@@ -78,7 +78,7 @@ class HandShape:
     def self_collision(self, joints: Float[Tensor, "N J"]) -> Bool[Tensor, "N"]:
         """Return whether links overlap by more than 0.5 mm that do not do so in the open posture anyway."""
         values = np.ascontiguousarray(joints.detach().cpu().double().numpy())
-        return torch.from_numpy(_self_collisions(self.body, self.pairs, values).any(axis=1)).to(joints.device)
+        return torch.from_numpy(self_collisions(self.body, self.pairs, values).any(axis=1)).to(joints.device)
 
     @property
     def pairs(self) -> np.ndarray:
@@ -94,7 +94,7 @@ class HandShape:
             closed = body.rates.sum(axis=0)
             low, high = body.joint_limits.T
             opened = np.where(closed > 0, low, np.where(closed < 0, high, np.clip(0, low, high)))
-            self._pairs = pairs[~_self_collisions(body, pairs, opened[None])[0]]
+            self._pairs = pairs[~self_collisions(body, pairs, opened[None])[0]]
         return self._pairs
 
     def cloud_depth(
@@ -105,7 +105,7 @@ class HandShape:
         Points and `pose` share a frame. Exact for the convex parts: the distance to the nearest side of one of them.
         """
         cloud = np.ascontiguousarray(points.detach().cpu().double().numpy())
-        return torch.from_numpy(_cloud_depths(self.body, cloud, *as_arrays(pose, joints))).to(pose)
+        return torch.from_numpy(cloud_depths(self.body, cloud, *as_arrays(pose, joints))).to(pose)
 
 
 def _cores(body: HandBody) -> np.ndarray:
@@ -252,81 +252,4 @@ def _heights(body: HandBody, bases: np.ndarray, joints: np.ndarray) -> np.ndarra
             corner = body.vertices[k]
             least = min(least, row[0] * corner[0] + row[1] * corner[1] + row[2] * corner[2] + row[3])
         found[i] = least
-    return found
-
-
-@njit(cache=True)
-def _self_collisions(body: HandBody, pairs: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Return (N, Q) whether each pair of links overlaps, by descending both ball trees."""
-    body, pairs, joints = borrowed(body), borrowed(pairs), borrowed(joints)
-    found = np.zeros((len(joints), len(pairs)), np.bool_)
-    full, poses, base = np.empty(len(body.offset)), np.empty((len(body.parents), 3, 4)), np.eye(4)[:3]
-    stack = np.empty((1024, 2), np.int64)
-    for i in range(len(joints)):
-        place_links(body, joints[i], base, full, poses)
-        for q in range(len(pairs)):
-            one, two = pairs[q]
-            stack[0, 0], stack[0, 1] = body.roots[pairs[q, 0]], body.roots[pairs[q, 1]]
-            top = 1
-            while top:
-                top -= 1
-                a, b = stack[top]
-                ax, ay, az = carry(poses, one, body.balls, a)
-                bx, by, bz = carry(poses, two, body.balls, b)
-                touch = body.balls[a, 3] + body.balls[b, 3] - SELF_OVERLAP
-                if touch <= 0 or (ax - bx) ** 2 + (ay - by) ** 2 + (az - bz) ** 2 >= touch * touch:
-                    continue
-                inner_a, inner_b = body.children[a, 0] >= 0, body.children[b, 0] >= 0
-                if not inner_a and not inner_b:
-                    found[i, q] = True
-                    break
-                for side in range(2):
-                    if inner_a and (not inner_b or body.balls[a, 3] >= body.balls[b, 3]):
-                        stack[top, 0], stack[top, 1] = body.children[a, side], b
-                    else:
-                        stack[top, 0], stack[top, 1] = a, body.children[b, side]
-                    top += 1
-    return found
-
-
-@njit(cache=True)
-def _cloud_depths(body: HandBody, cloud: np.ndarray, bases: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    body, cloud, bases, joints = borrowed(body), borrowed(cloud), borrowed(bases), borrowed(joints)
-    found = np.zeros(len(bases))
-    full, poses = np.empty(len(body.offset)), np.empty((len(body.parents), 3, 4))
-    parts = len(body.part_links)
-    centers, squares = np.empty((parts, 3)), body.part_balls[:, 3] ** 2
-    for i in range(len(bases)):
-        place_links(body, joints[i], bases[i], full, poses)
-        middle, around = np.zeros(3), 0.0
-        for p in range(parts):
-            x, y, z = carry(poses, body.part_links[p], body.part_balls, p)
-            centers[p, 0], centers[p, 1], centers[p, 2] = x, y, z
-            middle += centers[p] / parts
-        for p in range(parts):
-            around = max(around, np.sqrt(((centers[p] - middle) ** 2).sum()) + body.part_balls[p, 3])
-        around *= around
-        m0, m1, m2 = middle
-        best = 0.0
-        for k in range(len(cloud)):
-            x, y, z = cloud[k, 0], cloud[k, 1], cloud[k, 2]
-            if (x - m0) ** 2 + (y - m1) ** 2 + (z - m2) ** 2 > around:
-                continue
-            for p in range(parts):
-                dx, dy, dz = x - centers[p, 0], y - centers[p, 1], z - centers[p, 2]
-                if dx * dx + dy * dy + dz * dz > squares[p]:
-                    continue
-                pose = poses[body.part_links[p]]
-                ux, uy, uz = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
-                lx = pose[0, 0] * ux + pose[1, 0] * uy + pose[2, 0] * uz
-                ly = pose[0, 1] * ux + pose[1, 1] * uy + pose[2, 1] * uz
-                lz = pose[0, 2] * ux + pose[1, 2] * uy + pose[2, 2] * uz
-                depth = np.inf
-                for s in range(body.parts[p], body.parts[p + 1]):
-                    side = body.planes[s]
-                    depth = min(depth, side[3] - side[0] * lx - side[1] * ly - side[2] * lz)
-                    if depth <= best:
-                        break
-                best = max(best, depth)
-        found[i] = best
     return found

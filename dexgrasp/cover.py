@@ -5,7 +5,7 @@ inscribed in the link would: what bounds the distance to one bounds it to the ot
 touch the surface here and there, these leave nothing out.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,14 +13,11 @@ import trimesh
 from scipy.spatial import ConvexHull, cKDTree
 
 from dexgrasp.ball_tree import inscribed, planes
-from dexgrasp.kinematics import LinkRecord
 
 PIECE = 2.5e-3
 """Patches are made of pieces of faces, with edges of at most this, m."""
 TOLERANCE = 1.3e-3
 """How far balls may stand out, m; but more at sharp edges."""
-STILL = 1e-9
-"""Speed of what does not move, such as centres on a joint's axis, m."""
 FLAT = 1e-9
 """Patches thinner than this are plane, m."""
 GAIN = 1e-3
@@ -56,101 +53,7 @@ class Cover(NamedTuple):
     """(F, M) bound of the acceleration of these points at a constant closing speed."""
 
 
-PER_FINGER = ("speeds", "patch_speeds", "bends")
-
-
-def hand_cover(
-    links: Sequence[LinkRecord],
-    parts: Mapping[str, Sequence[trimesh.Trimesh]],
-    limits: np.ndarray,
-    rates: np.ndarray,
-) -> Cover:
-    """Cover those links that fingers move: by full joints' velocities (F, M), within limits (M, 2)."""
-    known: dict[bytes, tuple[Cover, list[np.ndarray]]] = {}  # the fingers of a hand are often alike
-    trees: list[Cover] = []
-    roots, moving = np.full(len(links), -1), np.zeros(len(links), dtype=bool)
-    count = first = total = 0
-    for number, link in enumerate(links):
-        moving[number] = link.parent >= 0 and moving[link.parent]
-        moving[number] |= link.index >= 0 and bool(rates[:, link.index].any())
-        bodies = parts.get(link.name, ())
-        if bodies and moving[number]:
-            key = b"".join(np.asarray(part.vertices).tobytes() for part in bodies)
-            if key not in known:
-                known[key] = _link_cover(bodies)
-            tree, surface = known[key]
-            cuts = np.cumsum([len(points) for points in surface])[:-1]
-            of_centers, of_points = (
-                np.array([_speeds(points, number, links, limits, rate) for rate in rates])
-                for points in (tree.balls[:, :3], np.concatenate(surface))
-            )  # (F, 2, K)
-            most = np.stack(
-                [p.max(axis=2, initial=STILL) for p in np.split(of_points, cuts, axis=2)],
-                axis=2,
-            )
-            trees.append(
-                tree._replace(
-                    children=np.where(tree.children < 0, -1, tree.children + count),
-                    spans=tree.spans[:-1] + total,
-                    parts=np.where(tree.parts < 0, -1, tree.parts + first),
-                    links=np.full(len(tree.balls), number),
-                    speeds=of_centers[:, 0],
-                    patch_speeds=most[:, 0],
-                    bends=most[:, 1],
-                )
-            )
-            roots[number] = count
-            count += len(tree.balls)
-            total += len(tree.points)
-        first += len(bodies)
-    joined = {
-        name: np.concatenate([getattr(tree, name) for tree in trees], axis=int(name in PER_FINGER))
-        for name in Cover._fields
-        if name != "roots"
-    }
-    return Cover(**joined | {"roots": roots, "spans": np.append(joined["spans"], total)})
-
-
-def _speeds(
-    points: np.ndarray,
-    link: int,
-    links: Sequence[LinkRecord],
-    limits: np.ndarray,
-    rate: np.ndarray,
-) -> np.ndarray:
-    """Bound speed and acceleration (2, K) of points (K, 3) of a link, whatever the posture, at joint speeds `rate`.
-
-    Moving joints i and k at once, k below i or i itself, accelerates a point by at most its distance to k's axis.
-    """
-    speeds, bends, reach = (
-        np.zeros(len(points)),
-        np.zeros(len(points)),
-        np.zeros(len(points)),
-    )
-    turned = False
-    while link >= 0:
-        record = links[link]
-        velocity = abs(rate[record.index]) if record.index >= 0 else 0.0
-        # Distances to the axis of the joint at hand: exact for the last one, bounded by the chain's lengths above it.
-        if record.kind == "revolute":
-            speed = velocity * (reach if turned else np.linalg.norm(np.cross(points, record.axis), axis=1))
-            bends += velocity * (speed + 2 * speeds)
-            speeds += speed
-        elif record.kind == "prismatic":
-            speeds += velocity
-        if not turned and record.kind == "fixed":
-            points = points @ record.parent_T_joint[:3, :3].T + record.parent_T_joint[:3, 3]
-        else:
-            if not turned:
-                turned, reach = True, np.linalg.norm(points, axis=1)
-            if record.kind == "prismatic":
-                reach = reach + np.abs(limits[record.index]).max()
-            reach = reach + np.linalg.norm(record.parent_T_joint[:3, 3])
-        link = record.parent
-    return np.maximum([speeds, bends], STILL)
-
-
-def _link_cover(parts: Sequence[trimesh.Trimesh]) -> tuple[Cover, list[np.ndarray]]:
+def link_cover(parts: Sequence[trimesh.Trimesh]) -> tuple[Cover, list[np.ndarray]]:
     """Cover the surface of a union of convex parts; return the tree and the points (K, 3) of the patch in each leaf."""
     sides = [planes(part) for part in parts]
     leaves, patches, owners = [], [], []

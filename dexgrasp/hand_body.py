@@ -6,9 +6,10 @@ import numpy as np
 from numba import njit
 
 from dexgrasp.ball_tree import ball_tree, inscribed_balls, planes
-from dexgrasp.cover import Cover, hand_cover
+from dexgrasp.cover import Cover
 from dexgrasp.errors import DexgraspError
 from dexgrasp.hand import Hand
+from dexgrasp.hand_cover import hand_cover
 from dexgrasp.urdf import UrdfHand
 
 TIP_TOLERANCE = 1e-4

@@ -11,7 +11,7 @@ import shutil
 import sys
 from pathlib import Path
 
-KEPT = 4
+KEPT = 12
 """States of the sources whose code is kept, the latest ones."""
 
 

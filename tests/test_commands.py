@@ -331,6 +331,22 @@ def test_ctrl_c_reaches_the_jobs_once(multirun):
     assert not list(multirun.runs.glob("*/2")) and not list(multirun.runs.rglob("*.pickle"))
 
 
+def test_sigterm_is_as_ctrl_c():
+    program = (
+        "import sys, time, types; from dexgrasp import __main__ as command;"
+        "nap = lambda rest: (print('sleeps', flush=True), time.sleep(600));"
+        "sys.modules['dexgrasp.commands.nap'] = types.SimpleNamespace(main=nap); command.TOOLS['nap'] = '';"
+        "sys.exit(command.main(['nap']))"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "sleeps\n"
+    process.terminate()
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and err.strip() == "dexgrasp nap: interrupted"
+
+
 def test_a_second_ctrl_c_ends_jobs_that_do_not_obey(multirun):
     process = multirun("seed=10,10", "hydra.launcher.workers=2")
     for word in ("says", "deaf"):
