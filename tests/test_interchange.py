@@ -184,7 +184,7 @@ def test_multidex_needs_joints_and_units(tmp_path):
     q = torch.tensor([10.0, 20.0, 30.0, 90.0, 0.0, 90.0, 45.0, 60.0])
     path = tmp_path / "cmap.pt"
     torch.save({"info": {}, "metadata": [(q, "ycb+apple", "claw"), (q[:7], "ycb+pear", "jaw")]}, path)
-    told = Told(joints=("a", "b"), units=("mm", "deg"), hand="claw")
+    told = Told(joints=("a", "b"), units=("mm", "deg"), robot="claw")
     grasps = read_grasps(path, told)
     assert grasps.objects == ("apple",) and grasps.scale[0] == 0.001
     np.testing.assert_allclose(grasps.grasp.pose[0, :3, 3], [0.01, 0.02, 0.03])

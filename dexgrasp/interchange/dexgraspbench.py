@@ -56,7 +56,7 @@ class DexGraspBench(Format):
         }
         same = next((hand for hand, known in HANDS.items() if known == joint_names), "")
         return GraspSet(
-            hand=told.hand or parts[0][6] or same,
+            hand=told.robot or parts[0][6] or same,
             joint_names=joint_names,
             objects=tuple(name for part in parts for name in part[3]),
             scale=np.concatenate([part[4] for part in parts]),

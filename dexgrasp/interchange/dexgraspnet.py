@@ -40,7 +40,7 @@ class DexGraspNet(Format):
         """Joint names are those of a published hand, or those told."""
         entries = _entries(path)
         names = tuple(name for name in _qpos(entries[0], path, 0) if name not in (*PLACE, *TURN))
-        hand, right = told.hand, told.joints
+        hand, right = told.robot, told.joints
         if not right:
             near = max(HANDS, key=lambda key: len(set(HANDS[key]) & set(names)))
             hand, right = hand or near, HANDS[near]

@@ -21,7 +21,7 @@ class Told:
     """Names of the joints, in the file's order."""
     units: tuple[str, ...] = ()
     """Of lengths and of angles: m, cm or mm, and rad or deg."""
-    hand: str = ""
+    robot: str = ""
     """Which hand's grasps are read, as the file names it, where it holds those of several."""
     object: str = ""
     """Name of the object where the file has none."""

@@ -49,7 +49,7 @@ class GraspIt(Format):
         base, body = (np.concatenate([world[k] for world in worlds]) for k in (2, 3))
         # GraspIt! works in millimetres whatever the file's mesh was meant to be in.
         return GraspSet(
-            hand=told.hand or robot,
+            hand=told.robot or robot,
             joint_names=names,
             objects=tuple(told.object or world[4] for world in worlds),
             grasp=Posture(np.linalg.inv(body) @ base, np.array(rows)),

@@ -68,7 +68,7 @@ class Isaac(Format):
         scale = content.get("object_scale", 1.0 if told.scale is None else told.scale)
         count = len(grasps)
         return GraspSet(
-            hand=told.hand or _frame(content, "gripper"),
+            hand=told.robot or _frame(content, "gripper"),
             joint_names=joints,
             objects=(told.object or _frame(content, "object") or path.stem,) * count,
             grasp=Posture(pose, np.array(angles)),

@@ -35,10 +35,10 @@ class MultiDex(Format):
             raise DexgraspError(f"tensors and plain containers in {path}", found, "ask for plain data") from error
         rows = _rows(content, path, told)
         robots = sorted({robot for _, _, robot in rows})
-        hand = told.hand or (robots[0] if len(robots) == 1 else "")
-        if hand not in robots and not (told.hand and robots == [""]):
-            remedy = "tell which: hand=NAME" + ("" if told.hand else " (the file holds several)")
-            raise DexgraspError(f"a robot of {path}: {', '.join(robots)}", repr(told.hand), remedy)
+        hand = told.robot or (robots[0] if len(robots) == 1 else "")
+        if hand not in robots and not (told.robot and robots == [""]):
+            remedy = "tell which: robot=NAME" + ("" if told.robot else " (the file holds several)")
+            raise DexgraspError(f"a robot of {path}: {', '.join(robots)}", repr(told.robot), remedy)
         rows = [row for row in rows if row[2] in (hand, "")]
         length, angle = told.unit_factors(str(path))
         widths = {row[0].shape for row in rows}
