@@ -64,6 +64,8 @@ def _run(config: DictConfig, folder: Path, began: float) -> None:
     dataset = ensure(config.dataset, config.hand, config.repr)
     print(table(summary(dataset)))
     model = tuned or build_model(config, dataset.config["views"]["framing"]["points"], dataset.hand)
+    if tuned is None:  # else what was learnt then goes on
+        model.representation.prepare(dataset.grasps(index) for index in range(len(dataset.objects)))
     made = time.perf_counter()
     splits = {name: samples(dataset, model, name) for name in ("train", "validation") if dataset.split(name)}
     print(f"{len(splits['train'])} views, {splits['train'].graspable:.1%} of the seed points graspable")
