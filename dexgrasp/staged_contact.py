@@ -1,6 +1,5 @@
 """Heads that tell a grasp from one fingertip contact in three stages: finger, direction and main joints, the rest."""
 
-import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 
@@ -36,6 +35,9 @@ FEWEST = 16
 
 class StagedContact(Representation):
     """Parameters: `lead` numbers of the direction, then joint angles in slots: the touching finger's main joints first.
+
+    Of a hand that grasps with some of its fingers, too, which of them touch follows: 1 or 0 each. The joints of a
+    finger that does not touch are told like all others: it stays as they say, open and out of the way.
 
     What a slot means depends on the finger (paper: theta_ms, theta_m, theta_s1, theta_s2); each keeps the hand's
     order. Three stages (paper, figure 3): which finger touches, if any; direction and main joints; supporting
@@ -221,8 +223,13 @@ class StagedContact(Representation):
         """Run the three stages; `choice` takes another than the likeliest anchor, the less likely the higher it is.
 
         Returns finger (N, F + 1) logits, projection (N, V, anchors, 1 + told): logits and numbers, main and
+<<<<<<< HEAD
         supporting (N, V, slots, 2, bins): logits and residuals, touching (N, V, F) logits where fingers may be left
         out. V is F with `per_finger`, else 1.
+=======
+        supporting (N, V, slots, 2, bins): logits and residuals, touching (N, V, F) logits where fingers
+        may be left out. V is F with `per_finger`, else 1.
+>>>>>>> reprs
         """
         outputs = self.stages["finger"](features)
         if truth is None:
@@ -351,17 +358,6 @@ def _without_likeliest(projection: Float[Tensor, "N V A K"], count: int) -> Floa
     logits, told = projection[..., :1], projection[..., 1:]
     best = logits.topk(count, dim=2).indices
     return torch.cat([logits.scatter(2, best, torch.finfo(logits.dtype).min), told], dim=-1)
-
-
-def golden_spiral(count: int, lowest: float = 0.0) -> Float[Tensor, "A 3"]:
-    """Return unit vectors, float64, spread evenly over the part of the sphere with z > `lowest`; a single one is +z."""
-    if count == 1:
-        return torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-    number = torch.arange(count, dtype=torch.float64)
-    z = 1 - (1 - lowest) * (number + 0.5) / count
-    turn = math.pi * (3 - 5**0.5) * number
-    radius = (1 - z * z).sqrt()
-    return torch.stack([radius * turn.cos(), radius * turn.sin(), z], dim=-1)
 
 
 def _kinds(hand: Hand) -> Int[Tensor, "F J"]:

@@ -65,5 +65,6 @@ def _surface(hand: Hand, finger: Finger) -> tuple[Float[Tensor, "K 3"], Float[Te
         nothing = torch.empty(0, 3, dtype=torch.float64)
         return nothing, nothing
     whole = trimesh.util.concatenate(parts)
+    assert isinstance(whole, trimesh.Trimesh)
     points, _ = trimesh.sample.sample_surface(whole, SAMPLES, seed=0)
     return torch.from_numpy(np.array(whole.vertices)), torch.from_numpy(np.array(points))

@@ -5,8 +5,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dexgrasp.contact_frame import place, project
+from dexgrasp.geometry import golden_spiral
 from dexgrasp.grasps import Grasps
+<<<<<<< HEAD
 from dexgrasp.staged_contact import StagedContact, golden_spiral
+=======
+from dexgrasp.staged_contact import StagedContact
+>>>>>>> reprs
 
 
 class Contact(StagedContact):

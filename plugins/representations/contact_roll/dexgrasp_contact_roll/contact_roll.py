@@ -8,9 +8,9 @@ from torch import Tensor
 
 from dexgrasp.contact_frame import SINGULAR, contact_frame, finger_direction, tip_rotation
 from dexgrasp.errors import DexgraspError
-from dexgrasp.geometry import axis_angle, inverse, pose
+from dexgrasp.geometry import axis_angle, golden_spiral, inverse, pose
 from dexgrasp.grasps import Grasps
-from dexgrasp.staged_contact import StagedContact, golden_spiral
+from dexgrasp.staged_contact import StagedContact
 from dexgrasp.tip_surface import TipSurface
 
 FEWEST = 8

@@ -83,7 +83,7 @@ class ContactWidth(Representation):
         return middles.to(directions)[finger]
 
     def encode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grasps: Grasps) -> Targets:
-        """Tell N grasps; `encodable` is False only where no finger was chosen (then `finger` is 0)."""
+        """Tell N grasps; `encodable` is False where no finger was chosen (then `finger` is 0), or a pad is left out."""
         grasps = grasps.to(points)
         frames = grasps.pose[:, :3, :3] @ self.jaws.frames(grasps.finger.clamp(min=0), points)
         width = self.jaws.closed + self.jaws.rate * grasps.joints[:, self.jaws.joint]
@@ -91,7 +91,7 @@ class ContactWidth(Representation):
             finger=grasps.finger + 1,
             parameters=torch.cat([frames[..., 0], frames[..., 1], width.unsqueeze(-1)], dim=-1),
             quality=grasps.quality,
-            encodable=grasps.finger >= 0,
+            encodable=(grasps.finger >= 0) & grasps.touching.all(dim=-1),
         )
 
     def decode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], prediction: Prediction) -> Grasps:

@@ -16,7 +16,7 @@ from dexgrasp.hand import Hand
 from dexgrasp.heads import CERTAIN, Heads, contact_points, finger_loss, known_points, mean, told_grasps
 from dexgrasp.representation import Prediction, Representation, Targets
 from dexgrasp.seeds import stream
-from dexgrasp.staged_contact import golden_spiral
+from dexgrasp.touching import fingers_as_prediction, fingers_loss, told_fingers, told_size
 from dexgrasp_grasp_type.bins import Bins
 from dexgrasp_grasp_type.taxonomy import drawn_postures, nearest_type, taxonomy
 
@@ -32,6 +32,8 @@ class GraspType(Representation):
     here does so with its fingertip circle's ball. Joints are told as a type, one of the hand's own, and offsets from
     its posture; all else is told once for each type, so that each has an answer (Li et al. 2022, "HGC-Net").
 
+    Of a hand that grasps with some of its fingers, too, which of them touch follows: 1 or 0 each.
+
     Types are clusters of the postures of the dataset's grasps, found when a training begins (`prepare`) and kept in the
     checkpoint; before, postures at random. The numbers in `Targets` do not depend on them.
 
@@ -45,8 +47,8 @@ class GraspType(Representation):
         scale: unit of the joint offsets, in ranges of the joints.
         hidden: widths of the hidden layers of each MLP.
         separate_heads: an MLP for each output; else all but finger and type share hidden layers.
-        alpha, beta_type, beta_approach, beta_angle, beta_depth, gamma: weights of finger identity, type, approach,
-            angle, depth and joint offsets.
+        alpha, beta_type, beta_approach, beta_angle, beta_depth, gamma, delta: weights of finger identity, type,
+            approach, angle, depth, joint offsets, and which fingers touch.
         none_weight, focal: see `finger_loss`.
         huber: residual (in bins; offset in `scale`) at which the loss turns from quadratic to linear.
     """
@@ -72,6 +74,7 @@ class GraspType(Representation):
         beta_angle: float = 5.0,
         beta_depth: float = 5.0,
         gamma: float = 5.0,
+        delta: float = 1.0,
         none_weight: float = 1.0,
         focal: float = 0.0,
         huber: float = 1.0,
@@ -82,16 +85,17 @@ class GraspType(Representation):
             if value < fewest:
                 raise DexgraspError(f"repr.{name} of at least {fewest}", str(value), "set it so")
         self.hand, self.choices = hand, types
-        self.alpha, self.gamma = alpha, gamma
+        self.alpha, self.gamma, self.delta = alpha, gamma, delta
         self.betas = {"type": beta_type, "approach": beta_approach, "angle": beta_angle, "depth": beta_depth}
         self.none_weight, self.focal, self.huber = none_weight, focal, huber
         lower, upper = hand.limits.double().unbind(-1)
         self.moving = (upper > lower).nonzero().flatten().tolist()
-        self.size = 5 + len(lower)
+        self.fingers = told_size(hand)
+        self.size = 5 + len(lower) + self.fingers
         self.angle = Bins(-math.pi, 2 * math.pi / angles, angles, wraps=True)
         near, far = _depths(hand)
         self.depth = Bins(near, (far - near) / depths, depths)
-        self.register_buffer("anchors", golden_spiral(approaches, lowest=-1.0), persistent=False)
+        self.register_buffer("anchors", geometry.golden_spiral(approaches, lowest=-1.0), persistent=False)
         self.register_buffer("ranges", torch.where(upper > lower, upper - lower, 1.0).float(), persistent=False)
         self.register_buffer("centres", drawn_postures(hand, types).float())  # learnt: part of the checkpoint
         self.anchors: Tensor
@@ -99,7 +103,7 @@ class GraspType(Representation):
         self.centres: Tensor
         self.scale = scale
         self.shapes = {"approach": (approaches, 3), "angle": (2, angles), "depth": (2, depths)}
-        self.shapes |= {"offsets": (len(self.moving),)}
+        self.shapes |= {"offsets": (len(self.moving),)} | ({"touching": (self.fingers,)} if self.fingers else {})
         sizes = {name: types * math.prod(shape) for name, shape in self.shapes.items()}
         self.stage_1 = Heads(
             channels, {"finger": len(hand.fingers) + 1, "type": types}, hidden, separate=separate_heads
@@ -111,7 +115,14 @@ class GraspType(Representation):
         self.centres.copy_(taxonomy(self.hand, grasps, len(self.centres)))
 
     def encode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grasps: Grasps) -> Targets:
+<<<<<<< HEAD
         """Tell N grasps; `encodable` is False where no finger was chosen (then `finger` is 0) or one does not touch."""
+=======
+        """Tell N grasps; `encodable` is False only where no finger was chosen (then `finger` is 0).
+
+        And where a finger does not touch of a hand that grasps with all of them (`Hand.least_fingers`).
+        """
+>>>>>>> reprs
         grasps = grasps.to(points)
         palm = grasps.pose @ self.hand.base_T_palm.to(points)
         approach = palm[:, :3, 2]
@@ -120,9 +131,15 @@ class GraspType(Representation):
         depth = ((points - palm[:, :3, 3]) * approach).sum(-1, keepdim=True)
         return Targets(
             finger=grasps.finger + 1,
-            parameters=torch.cat([approach, angle, depth, grasps.joints], dim=-1),
+            parameters=torch.cat(
+                [approach, angle, depth, grasps.joints, grasps.touching[:, : self.fingers].to(approach)], dim=-1
+            ),
             quality=grasps.quality,
+<<<<<<< HEAD
             encodable=(grasps.finger >= 0) & grasps.touching.all(dim=-1),
+=======
+            encodable=(grasps.finger >= 0) & (grasps.touching.all(dim=-1) | bool(self.fingers)),
+>>>>>>> reprs
         )
 
     def decode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], prediction: Prediction) -> Grasps:
@@ -148,13 +165,15 @@ class GraspType(Representation):
         depth = ((points - palm) * approach).sum(-1)
         base = base + (depth - self.depth.join(told["depth"])).unsqueeze(-1) * approach
         pose = geometry.pose(rotation, base)
-        return told_grasps(self.hand, points, normals, finger, pose, joints, 1 - probability[:, 0])
+        touching = told_fingers(self.hand, told.get("touching"), finger)
+        return told_grasps(self.hand, points, normals, finger, pose, joints, 1 - probability[:, 0], touching)
 
     def forward(self, features: Float[Tensor, "N C"], truth: Targets | None = None, choice: int = 0) -> Prediction:
         """Run the heads; `choice` takes another than the likeliest type, the less likely the higher it is.
 
         Returns finger (N, F + 1) and type (N, K) logits, and for each type: approach (N, K, approaches, 3) logits and
-        offsets, angle (N, K, 2, bins) and depth (N, K, 2, bins) logits and residuals, offsets (N, K, moving joints).
+        offsets, angle (N, K, 2, bins) and depth (N, K, 2, bins) logits and residuals, offsets (N, K, moving joints);
+        touching (N, K, F) logits where fingers may be left out.
         """
         first, told = self.stage_1(features), self.stage_2(features)
         if choice:
@@ -182,6 +201,9 @@ class GraspType(Representation):
             "depth": self.depth.loss(told["depth"], truth[:, 4], self.huber),
         }
         weighed = {name: self.betas[name] * mean(term) for name, term in terms.items()}
+        if self.fingers:
+            touching = fingers_loss(told["touching"], truth[:, -self.fingers :], targets.finger[contact] - 1)
+            weighed["touching"] = self.delta * mean(touching)
         return {"finger": self.alpha * classes, **weighed, "joints": self.gamma * mean(joints)}
 
     def as_prediction(self, targets: Targets) -> Prediction:
@@ -197,6 +219,8 @@ class GraspType(Representation):
             "depth": self.depth.as_prediction(truth[:, 4]),
             "offsets": offsets,
         }
+        if self.fingers:
+            told["touching"] = fingers_as_prediction(truth[:, -self.fingers :])
         types = len(self.centres)
         finger = CERTAIN * F.one_hot(targets.finger, len(self.hand.fingers) + 1).to(truth)
         each = {name: value.unsqueeze(1).expand(-1, types, *value.shape[1:]).clone() for name, value in told.items()}
@@ -206,7 +230,7 @@ class GraspType(Representation):
         self, truth: Float[Tensor, "N P"]
     ) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"], Float[Tensor, "N 2"], Float[Tensor, "N S"]]:
         """Return type, approach's anchor and offset in its tangent plane, and joint offsets in units of `scale`."""
-        joints, ranges = truth[:, 5:], self.ranges.to(truth)
+        joints, ranges = truth[:, 5 : 5 + len(self.ranges)], self.ranges.to(truth)
         kind = nearest_type(joints, self.centres.to(truth), ranges)
         anchors = self.anchors.to(truth)
         anchor = (truth[:, :3] @ anchors.T).argmax(-1)
