@@ -13,7 +13,7 @@ from dexgrasp.errors import DexgraspError, room
 PIPELINES = {
     "dataset": "objects -> grasps -> scenes -> views -> labels; dataset estimate|inspect|verify|merge|export|card",
     "train": "train a network, evaluate it in physics, show the result",
-    "eval": "run a trained network (or the labels) in physics",
+    "eval": "a trained network in physics: model=RUN; or a set of grasps under several protocols: grasps=FILE",
     "predict": "grasps for one point cloud or depth image",
     "fidelity": "how much of a grasp each representation keeps",
 }
@@ -22,7 +22,8 @@ PIPELINES = {
 TOOLS = {
     "plugins": "list installed hands, representations and backbones",
     "hand": "hand check <name>: look a hand over; hand init <file>: write one from a URDF",
-    "report": "write the report of an evaluation again: report <folder>",
+    "convert": "other people's grasps: what is in a file, and into another format: convert <file> [--to FILE]",
+    "report": "one leaderboard over any set of runs, HTML and Markdown: report RUN...",
 }
 """Ordinary arguments."""
 
@@ -50,6 +51,12 @@ def main(argv: list[str] | None = None) -> int:
             return int(import_module(f"dexgrasp.commands.{command}").main(rest) or 0)
         if rest[:1] and rest[0] in VERBS.get(command, ()):
             return int(import_module(f"dexgrasp.commands.{command}").tool(rest) or 0)
+        if command == "eval" and any(word.startswith("grasps=") for word in rest):
+            # For Hydra `protocol` is a group, of which it takes one.
+            return pipeline(
+                "score",
+                [word.replace("protocol=", "protocols=", 1) if word.startswith("protocol=") else word for word in rest],
+            )
         if (command, *rest[:1]) in PARTS:
             return pipeline(PARTS[command, rest[0]], rest[1:])
         if command in PIPELINES:

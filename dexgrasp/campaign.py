@@ -28,7 +28,7 @@ from dexgrasp.selection import Selection
 from dexgrasp.settings import read
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import Protocol
-from dexgrasp.statistics import bootstrap_ratio
+from dexgrasp.statistics import rate_interval
 from dexgrasp.touching import fewest_fingers
 from dexgrasp.wrench_model import WrenchModel, torsion_of
 
@@ -60,7 +60,7 @@ class Campaign:
         episodes = [episode for episode, _ in done]
         results: dict[str, Any] = {
             "protocol": str(self.protocol),
-            "protocol_values": asdict(self.protocol),
+            "protocol_values": self.protocol.values(),
             "policy": asdict(self.policy),
             "selection": asdict(self.selection),
             "top_k": self.top_k,
@@ -144,5 +144,5 @@ def _ceiling_rates(verdicts: list[dict[str, list[bool]]], seed: int) -> dict[str
     rates = {}
     for kind in verdicts[0] if verdicts else {}:
         wins, tries = [sum(v[kind]) for v in verdicts], [len(v[kind]) for v in verdicts]
-        rates[kind] = rate(float(sum(wins)), sum(tries), bootstrap_ratio(wins, tries, seed))
+        rates[kind] = rate(float(sum(wins)), sum(tries), rate_interval(wins, tries, seed)[0])
     return rates

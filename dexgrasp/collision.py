@@ -43,6 +43,18 @@ class HandShape:
         found = _object_distances(self.body, field.field, *as_arrays(pose, joints))
         return torch.from_numpy(found).to(pose)
 
+    def link_distances(
+        self, field: DistanceField, pose: Float[Tensor, "N 4 4"], joints: Float[Tensor, "N J"]
+    ) -> Float[Tensor, "N L"]:
+        """Return `object_distance` of each link of the tree alone; infinity for links without a body."""
+        arrays = as_arrays(pose, joints)
+        found = np.full((len(pose), len(self.body.roots)), np.inf)
+        for link in np.flatnonzero(self.body.roots >= 0):
+            alone = np.full_like(self.body.roots, -1)
+            alone[link] = self.body.roots[link]
+            found[:, link] = _object_distances(self.body._replace(roots=alone), field.field, *arrays)
+        return torch.from_numpy(found).to(pose)
+
     def approach_clear(
         self,
         field: DistanceField,

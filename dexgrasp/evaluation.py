@@ -21,7 +21,7 @@ from dexgrasp.scene import Boxes, View
 from dexgrasp.seeds import stream
 from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.simulation.simulator import Simulator
-from dexgrasp.statistics import bootstrap_ratio, wilson
+from dexgrasp.statistics import bootstrap_ratio, rate_interval
 
 Look = Callable[[Sequence[Object], Float[Tensor, "O 4 4"], int], View]
 """Renders the objects at their poses; the last argument seeds camera and noise."""
@@ -189,20 +189,19 @@ def ceilings(
 
 
 def summarise(episodes: Sequence[Episode], seed: int) -> dict[str, Any]:
-    """Return SR, CR and epsilon with 95 % intervals (bootstrap over scenes; Wilson where scenes hold one object)."""
+    """Return SR, CR and epsilon with 95 % intervals (`statistics.rate_interval` over scenes)."""
     wins = [sum(a.success for a in e.attempts) for e in episodes]
     tries = [len(e.attempts) for e in episodes]
     removed, present = [len(e.removed) for e in episodes], [len(e.present) for e in episodes]
-    single = all(count == 1 for count in tries)
-    interval = wilson(sum(wins), sum(tries)) if single else bootstrap_ratio(wins, tries, seed)
+    (interval, kind), (cleared, _) = rate_interval(wins, tries, seed), rate_interval(removed, present, seed)
     attempts = [attempt for episode in episodes for attempt in episode.attempts]
     qualities = [[a.epsilon for a in e.attempts if a.epsilon is not None] for e in episodes]
     return {
         "scenes": len(episodes),
         "attempts": sum(tries),
         "objects": sum(present),
-        "success_rate": {**rate(sum(wins), sum(tries), interval), "interval_kind": "wilson" if single else "bootstrap"},
-        "completion_rate": rate(sum(removed), sum(present), bootstrap_ratio(removed, present, seed)),
+        "success_rate": {**rate(sum(wins), sum(tries), interval), "interval_kind": kind},
+        "completion_rate": rate(sum(removed), sum(present), cleared),
         "epsilon": rate(
             float(sum(map(sum, qualities))),
             sum(map(len, qualities)),

@@ -40,6 +40,21 @@ def bootstrap_ratio(
     return float(low), float(high)
 
 
+def rate_interval(wins: Sequence[int], tries: Sequence[int], seed: int = 0) -> tuple[tuple[float, float], str]:
+    """Return the interval of sum(wins) / sum(tries) over groups (scenes, objects), and its kind.
+
+    Attempts of one group depend on each other: `bootstrap` over groups. `wilson` where each group has one attempt, or
+    there is one group, whose attempts then stand for themselves. Where all end alike there is nothing to draw from:
+    `wilson over groups`, as if each group were one attempt.
+    """
+    met = [count for count in tries if count > 0]
+    if len(met) < 2 or max(met) == 1:
+        return wilson(sum(wins), sum(tries)), "wilson"
+    if sum(wins) in (0, sum(tries)):
+        return wilson(len(met) if sum(wins) else 0, len(met)), "wilson over groups"
+    return bootstrap_ratio(wins, tries, seed), "bootstrap"
+
+
 def roc_area(scores: Float[Tensor, "N"], truth: Bool[Tensor, "N"]) -> float | None:
     """Return the area under the ROC: how often a true one scores more than a false one; ties count half.
 

@@ -49,7 +49,59 @@ def test_bulk_is_lift_v1_in_longer_steps() -> None:
     assert jerks[0] == pytest.approx(jerks[1], rel=0.01)
 
 
-@pytest.mark.parametrize("name", ["lift-v1", "lift-bulk-v1", "cmgnet-code"])
+def differences(name: str) -> dict:
+    """What a protocol has otherwise than lift-v1."""
+    values, reference = load_protocol(name).values(), load_protocol("lift-v1").values()
+    return {
+        key: value
+        for group in ("physics", "motion", "verdict")
+        for key, value in values[group].items()
+        if value != reference[group][key]
+    }
+
+
+def test_transport_and_shake_are_lift_v1_and_more() -> None:
+    for name, part in (("transport-v1", "transport"), ("shake-v1", "shake")):
+        assert differences(name) == {}
+        assert set(load_protocol(name).values()) == {*load_protocol("lift-v1").values(), part}
+
+
+def test_dexgraspbench_is_method_section_5() -> None:
+    assert differences("dexgraspbench") == {
+        "mass_min": 0.1, "mass_max": 0.1, "gravity": 0.0, "timestep": 0.004, "contact_time": 0.008, "intrusion": 0.01
+    }  # fmt: skip
+    rule = load_protocol("dexgraspbench").disturbance
+    assert (rule.force, rule.distance, rule.angle, rule.apart, rule.closing) == (10, 0.05, 15, True, True)
+
+
+def test_isaac_dro_is_method_section_5() -> None:
+    assert differences("isaac-dro").items() >= {"friction": 3.0, "gravity": 0.0, "mass_min": 0.0}.items()
+    rule = load_protocol("isaac-dro").disturbance
+    assert (rule.force, rule.distance, rule.angle, rule.apart, rule.closing) == (0.5, 0.02, None, False, False)
+
+
+def test_parts_that_are_not_there_do_not_change_a_protocol(config: dict) -> None:
+    assert load_protocol(config | {"shake": None}) == load_protocol("lift-v1")
+    assert "shake" not in load_protocol("lift-v1").values()
+    with pytest.raises(DexgraspError, match="shake"):
+        load_protocol(config | {"shake": {"period": 1.0}})
+    with pytest.raises(DexgraspError, match="table"):
+        load_protocol("isaac-dro").on_table("a test")
+
+
+def test_a_protocol_in_a_file_of_ones_own(tmp_path, config: dict) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(config | {"name": "mine"}))
+    assert load_protocol(str(path)).name == "mine"
+    path.write_text("- 1")
+    with pytest.raises(DexgraspError, match="keys of a protocol"):
+        load_protocol(str(path))
+
+
+NAMES = sorted(path.stem for path in (conf_folder() / "protocol").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_every_number_stands_in_the_yaml_and_old_configs_mean_the_same(name: str) -> None:
     config = yaml.safe_load((conf_folder() / "protocol" / f"{name}.yaml").read_text())
     protocol = load_protocol(config)

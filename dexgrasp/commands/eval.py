@@ -16,6 +16,7 @@ from dexgrasp.dataset import stages
 from dexgrasp.dataset.pipeline import ensure
 from dexgrasp.errors import DexgraspError
 from dexgrasp.evaluation import Policy
+from dexgrasp.fingerprint import scenes_hash
 from dexgrasp.report import draw_attempts, rows, write_report, write_results
 from dexgrasp.selection import Selection
 from dexgrasp.settings import read
@@ -44,7 +45,7 @@ class Settings:
             {str(key): value for key, value in options.items()},
             read(Policy, options["policy"], "evaluation.policy"),
             read(Selection, config.selection, "selection"),
-            load_protocol(OmegaConf.to_container(config.protocol)),  # type: ignore[arg-type]
+            load_protocol(OmegaConf.to_container(config.protocol)).on_table("a closed loop"),  # type: ignore[arg-type]
         )
 
 
@@ -81,6 +82,8 @@ def evaluate(config: DictConfig, hand: Mapping[str, Any], checkpoint: Path, fold
     results = {
         "title": f"{campaign.protocol.name}: {checkpoint.parent.name}",
         "model": str(checkpoint),
+        "hand": dataset.hand.name,
+        "data": {"hash": scenes_hash(dataset), "objects": len(dataset.objects), "scenes": dataset.scenes},
         "objects": options["dataset"]["objects"],
         "scenes": options["dataset"]["scenes"],
         "times": {"data": made - began, "episodes": time.perf_counter() - made},

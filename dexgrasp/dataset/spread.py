@@ -73,9 +73,13 @@ def coverage(hand: Hand, surface: Surface, grasps: Grasps) -> Coverage:
         return Coverage(0.0, 0.0)
     contacts = _scaled(grasps.contacts[touched], grasps.normals[touched])
     away, _ = cKDTree(contacts).query(_scaled(surface.points[room], surface.normals[room]), distance_upper_bound=1.0)
-    palms = (grasps.pose.double() @ hand.base_T_palm)[:, :3, 2].numpy()
-    parts = cKDTree(_sphere(DIRECTIONS)).query(palms)[1]
+    parts = direction_parts((grasps.pose.double() @ hand.base_T_palm)[:, :3, 2].numpy())
     return Coverage(float(np.isfinite(away).mean()) if len(away) else 0.0, len(np.unique(parts)) / DIRECTIONS)
+
+
+def direction_parts(directions: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
+    """Return which of 200 equal parts of the sphere each unit vector lies in."""
+    return np.asarray(cKDTree(_sphere(DIRECTIONS)).query(directions)[1])
 
 
 def _scaled(points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Float[np.ndarray, "N 6"]:

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -55,7 +55,7 @@ class VerifySettings:
     @cached_property
     def rules(self) -> Protocol:
         """The protocol; raises DexgraspError where there is none of that name."""
-        return load_protocol(self.protocol)
+        return load_protocol(self.protocol).on_table("lift tests")
 
     @property
     def identity(self) -> dict[str, str]:
@@ -86,7 +86,7 @@ class Verdicts:
 
 def signature(protocol: Protocol) -> dict[str, str]:
     """Return what a store says of the protocol that gave its verdicts: name with version, hash of all settings."""
-    return {"protocol": str(protocol), "protocol_hash": digest(asdict(protocol))}
+    return {"protocol": str(protocol), "protocol_hash": digest(protocol.values())}
 
 
 def tally(reasons: Int[Tensor, "T"]) -> dict[str, Any]:
@@ -159,8 +159,9 @@ def metrics(grasps: Grasps, model: WrenchModel) -> dict[str, Float[Tensor, "N"]]
     """Return what is known of grasps (object frame) without physics; of all of them more should be better.
 
     `epsilon` and `volume` are of the L1 hull, `epsilon_linf` of the L-infinity hull (METHOD section 5); `spread` is
-    the contacts' mean distance from their centroid, `centred` minus the centroid's from the centre of mass, both m.
-    All are of the contacts of the fingers that touch; `model` has the centre of mass as its origin.
+    the contacts' mean distance from their centroid, `centred` minus the centroid's from the centre of mass, both m
+    (NaN where no finger touches). All are of the contacts of the fingers that touch; `model` has the centre of mass
+    as its origin.
     """
     contacts, normals = grasps.contacts.double(), grasps.normals.double()
     middle = contacts.nanmean(dim=1)

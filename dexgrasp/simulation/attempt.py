@@ -73,7 +73,7 @@ class Attempt:
         self.gripped = bool(self.world.touched().any())
         if not self.gripped:
             return self._result(self._failure())
-        lost = self._lift() or self._hold()
+        lost = self._lift() or self._hold(self.protocol.motion.hold) or self._transport() or self._shake()
         return self._result(self._failure() if lost else self._verdict())
 
     def _approach(self) -> bool:
@@ -165,15 +165,38 @@ class Attempt:
         path[:, 2] += lift * (0.5 - 0.5 * np.cos(np.pi * np.arange(1, steps + 1) / steps))
         return any(self._lost() for _ in self._carried(path))
 
-    def _hold(self) -> bool:
-        """Return True when the hand lost everything while it held still.
+    def _transport(self) -> bool:
+        """Return True when the hand lost everything on the way to another place, or there."""
+        way = self.protocol.transport
+        if way is None:
+            return False
+        steps = self._steps(way.time)
+        share = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, steps + 1) / steps)
+        path = self.data.mocap_pos[0] + share[:, None] * np.array([way.distance, 0.0, 0.0])
+        return any(self._lost() for _ in self._carried(path)) or self._hold(way.hold)
+
+    def _shake(self) -> bool:
+        """Return True when the hand lost everything while it was shaken along six directions, or after it."""
+        shake = self.protocol.shake
+        if shake is None:
+            return False
+        steps, rate = self._steps(shake.period), 2 * np.pi / shake.period
+        way = shake.acceleration / rate**2 * (1 - np.cos(2 * np.pi * np.arange(1, steps + 1) / steps))
+        for direction in np.concatenate([np.eye(3), -np.eye(3)]):
+            path = self.data.mocap_pos[0] + way[:, None] * direction
+            if any(self._lost() for _ in self._carried(path)):
+                return True
+        return self._hold(shake.hold)
+
+    def _hold(self, time: float) -> bool:
+        """Return True when the hand lost everything while it held still for `time` (s).
 
         A held object drifts for long at a steady pace, because simulated friction creeps. Between two looks that pace,
         where it is slow, is carried forward by `leap` at once (projective integration, Gear & Kevrekidis 2003); it is
         an average, as what has moved too far swings back.
         """
         model, data, physics = self.model, self.data, self.protocol.physics
-        left, leap = self._steps(self.protocol.motion.hold), self._steps(physics.leap)
+        left, leap = self._steps(time), self._steps(physics.leap)
         pace, now = np.zeros(model.nv), np.zeros(model.nv)
         looks = -2 * CALM
         while left > 0:

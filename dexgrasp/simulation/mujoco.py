@@ -16,6 +16,7 @@ from dexgrasp.hand import Hand
 from dexgrasp.objects import Object
 from dexgrasp.scene import Boxes
 from dexgrasp.simulation.attempt import Attempt, Plan, Result
+from dexgrasp.simulation.disturbed import DisturbedAttempt
 from dexgrasp.simulation.protocol import Physics, Protocol, load_protocol
 from dexgrasp.simulation.simulator import Simulator
 from dexgrasp.simulation.world import World
@@ -75,14 +76,14 @@ class MujocoSimulator(Simulator):
         start_pose, start_joints = (part.detach().numpy() for part in before)
         pose, joints = grasps.pose.detach().numpy(), hand.clamp(grasps.joints).detach().numpy()
         direction = closing_directions(hand, grasps.touching).numpy()
-        results = []
+        results, kind = [], Attempt if protocol.disturbance is None else DisturbedAttempt
         for n in range(len(grasps)):
             if skipped[n]:
                 results.append(Result(Reason.NO_GRASP, -1, 0.0, initial))
                 continue
             plan = Plan(start_pose[n], start_joints[n], pose[n], joints[n], direction[n])
             aim = -1 if target is None else int(target[n])
-            results.append(Attempt(world, initial, plan, protocol, aim).run())
+            results.append(kind(world, initial, plan, protocol, aim).run())
         return _outcomes(results, len(objects), poses)
 
     def world(

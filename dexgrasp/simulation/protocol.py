@@ -4,7 +4,9 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from pathlib import Path
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin
 
 import yaml
 
@@ -21,6 +23,11 @@ POSITIVE = (
     "closing_speed",
     "lift_time",
     "look",
+    "time",
+    "acceleration",
+    "period",
+    "force",
+    "distance",
 )
 """Keys that are divided by, or that mean nothing at 0; the others may be 0."""
 
@@ -140,6 +147,49 @@ class Verdict:
 
 
 @dataclass(frozen=True)
+class Transport:
+    """After the hold: what is held is carried sideways to another place and held there."""
+
+    distance: float
+    """How far the hand moves along world x, m."""
+    time: float
+    """s."""
+    hold: float
+    """Time for which it then holds still, s."""
+
+
+@dataclass(frozen=True)
+class Shake:
+    """After the hold: the hand is moved to and fro along six directions, one after another."""
+
+    acceleration: float
+    """Largest acceleration of the hand, m/s2; it moves by acceleration (1 - cos(w t)) / w^2, w = 2 pi / period."""
+    period: float
+    """Duration of each of the six, s."""
+    hold: float
+    """Time for which the hand then holds still, s."""
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """Instead of a lift: the object floats, the hand closes on it, and forces pull the object along six axes."""
+
+    force: float
+    """Force divided by the object's mass, N/kg, at its centre of mass."""
+    time: float
+    """For which each of the six acts, s."""
+    distance: float
+    """The object's centre of mass may move by this, m."""
+    angle: float | None
+    """And the object turn by this, degrees; None: as it likes."""
+    apart: bool
+    """Whether each force acts on the grasp as it was closed and is judged all the while; else one after another, and
+    the end is judged."""
+    closing: bool
+    """Whether what the closing fingers move counts as well."""
+
+
+@dataclass(frozen=True)
 class Protocol:
     """A named, versioned set of rules (METHOD section 5); every reported number carries `str(protocol)`."""
 
@@ -148,13 +198,27 @@ class Protocol:
     physics: Physics
     motion: Motion
     verdict: Verdict
+    transport: Transport | None = None
+    shake: Shake | None = None
+    disturbance: Disturbance | None = None
 
     def __str__(self) -> str:
         return f"{self.name} (version {self.version})"
 
+    def values(self) -> dict[str, Any]:
+        """Return all values as plain ones, without the parts that it does not have."""
+        return {key: value for key, value in dataclasses.asdict(self).items() if value is not None}
+
+    def on_table(self, what: str) -> "Protocol":
+        """Return itself; raises DexgraspError where its objects float, which `what` cannot do."""
+        if self.disturbance is not None:
+            remedy = "take a lift protocol, or score single grasps: eval grasps=FILE protocol=[...]"
+            raise DexgraspError(f"a protocol with objects on a table for {what}", str(self), remedy)
+        return self
+
 
 def load_protocol(config: str | Mapping[str, Any]) -> Protocol:
-    """Return a protocol from its name in `conf/protocol` or from a composed config.
+    """Return a protocol from its name in `conf/protocol`, the path of a YAML or a composed config.
 
     A key that has a default may be missing, as in configs that were saved before there was such a key.
 
@@ -165,12 +229,14 @@ def load_protocol(config: str | Mapping[str, Any]) -> Protocol:
         from dexgrasp.config import conf_folder
 
         folder = conf_folder() / "protocol"
-        path = folder / f"{config}.yaml"
+        own = config.endswith((".yaml", ".yml"))
+        path = Path(config).expanduser() if own else folder / f"{config}.yaml"
         if not path.is_file():
             known = ", ".join(sorted(file.stem for file in folder.glob("*.yaml")))
             raise DexgraspError(f"a protocol: {known}", repr(config), f"correct the name, or write {path}")
         config = yaml.safe_load(path.read_text())
-        assert isinstance(config, Mapping)
+        if not isinstance(config, Mapping):
+            raise DexgraspError(f"the keys of a protocol in {path}", type(config).__name__, "see conf/protocol")
     return _build(Protocol, config, f"protocol {config.get('name', '')}".strip())
 
 
@@ -192,9 +258,11 @@ def _build(kind: type[T], config: Mapping[str, Any], where: str) -> T:
 def _value(kind: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(kind):
         return _build(kind, value, where)  # type: ignore[arg-type]
-    optional = kind == float | None
-    if optional and value is None:
+    if get_origin(kind) is UnionType and value is None:
         return None
+    if get_origin(kind) is UnionType and dataclasses.is_dataclass(part := get_args(kind)[0]):
+        return _build(part, value, where)  # type: ignore[arg-type]
+    optional = kind == float | None
     number = isinstance(value, int | float) and not isinstance(value, bool)
     positive = where.rpartition(".")[2] in POSITIVE
     if (kind is float or optional) and number and math.isfinite(value) and (value > 0 if positive else value >= 0):

@@ -165,6 +165,11 @@ class World:
         linear, angular = velocity[:, :3], velocity[:, 3:]
         return np.maximum(np.linalg.norm(linear, axis=1), 0.1 * np.linalg.norm(angular, axis=1))
 
+    def pull(self, number: int, acceleration: Array) -> None:
+        """Let a force (3,) of so many N per kg of object `number` act at its centre of mass from now on."""
+        body = self._bodies[number]
+        self.data.xfrc_applied[body, :3] = self.model.body_mass[body] * acceleration
+
     def base(self) -> Array:
         """Return where the hand's base is (3,), world frame, m."""
         return self.data.xpos[self._base]
@@ -182,6 +187,12 @@ class World:
         contact = self.data.contact
         hands = (self._owner[contact.geom] == HAND).any(axis=1)
         return float(max(-contact.dist[hands].min(initial=0.0), 0.0))
+
+    def own_overlap(self) -> float:
+        """Return how deep links of the hand are in each other now, m, those aside that may touch."""
+        contact = self.data.contact
+        own = (self._owner[contact.geom] == HAND).all(axis=1)
+        return abs(float(contact.dist[own].min(initial=0.0)))
 
     def _touching(self, owner: int) -> NDArray[np.bool_]:
         result = np.zeros(len(self._bodies), dtype=bool)
