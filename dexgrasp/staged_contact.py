@@ -43,9 +43,6 @@ class StagedContact(Representation):
     order. Three stages (paper, figure 3): which finger touches, if any; direction and main joints; supporting
     joints. Angles in rad. In training, stages 2 and 3 run at contact points only.
 
-    Of a hand that grasps with some of its fingers, too, which of them touch follows: 1 or 0 each. The joints of a
-    finger that does not touch are told like all others: it stays as they say, open and out of the way.
-
     A subclass says what it tells of the direction u from the fingertip to the outer joint, and of all else that places
     the distal link: `lead`, `told` and the abstract methods. The contact frame is `contact_frame(normals)`.
 
@@ -223,13 +220,8 @@ class StagedContact(Representation):
         """Run the three stages; `choice` takes another than the likeliest anchor, the less likely the higher it is.
 
         Returns finger (N, F + 1) logits, projection (N, V, anchors, 1 + told): logits and numbers, main and
-<<<<<<< HEAD
-        supporting (N, V, slots, 2, bins): logits and residuals, touching (N, V, F) logits where fingers may be left
-        out. V is F with `per_finger`, else 1.
-=======
         supporting (N, V, slots, 2, bins): logits and residuals, touching (N, V, F) logits where fingers
         may be left out. V is F with `per_finger`, else 1.
->>>>>>> reprs
         """
         outputs = self.stages["finger"](features)
         if truth is None:

@@ -7,11 +7,7 @@ from torch import Tensor
 from dexgrasp.contact_frame import place, project
 from dexgrasp.geometry import golden_spiral
 from dexgrasp.grasps import Grasps
-<<<<<<< HEAD
-from dexgrasp.staged_contact import StagedContact, golden_spiral
-=======
 from dexgrasp.staged_contact import StagedContact
->>>>>>> reprs
 
 
 class Contact(StagedContact):

@@ -115,14 +115,10 @@ class GraspType(Representation):
         self.centres.copy_(taxonomy(self.hand, grasps, len(self.centres)))
 
     def encode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grasps: Grasps) -> Targets:
-<<<<<<< HEAD
-        """Tell N grasps; `encodable` is False where no finger was chosen (then `finger` is 0) or one does not touch."""
-=======
         """Tell N grasps; `encodable` is False only where no finger was chosen (then `finger` is 0).
 
         And where a finger does not touch of a hand that grasps with all of them (`Hand.least_fingers`).
         """
->>>>>>> reprs
         grasps = grasps.to(points)
         palm = grasps.pose @ self.hand.base_T_palm.to(points)
         approach = palm[:, :3, 2]
@@ -135,11 +131,7 @@ class GraspType(Representation):
                 [approach, angle, depth, grasps.joints, grasps.touching[:, : self.fingers].to(approach)], dim=-1
             ),
             quality=grasps.quality,
-<<<<<<< HEAD
-            encodable=(grasps.finger >= 0) & grasps.touching.all(dim=-1),
-=======
             encodable=(grasps.finger >= 0) & (grasps.touching.all(dim=-1) | bool(self.fingers)),
->>>>>>> reprs
         )
 
     def decode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], prediction: Prediction) -> Grasps:
