@@ -22,7 +22,6 @@ from dexgrasp.grasps import Grasps
 from dexgrasp.model import GraspNet, load_model
 from dexgrasp.objects import Object
 from dexgrasp.progress import track
-from dexgrasp.quality import epsilon, wrenches
 from dexgrasp.scene import View
 from dexgrasp.seeds import stream
 from dexgrasp.selection import Selection
@@ -30,7 +29,8 @@ from dexgrasp.settings import read
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.statistics import rate_interval
-from dexgrasp.wrench_model import torsion_of
+from dexgrasp.touching import fewest_fingers
+from dexgrasp.wrench_model import WrenchModel, torsion_of
 
 
 @dataclass(frozen=True)
@@ -90,13 +90,13 @@ class Campaign:
     def reached(self, item: Object, pose: Float[Tensor, "4 4"], grasp: Grasps) -> float:
         """Return epsilon of the contacts in which the fingers end on the true mesh, torque about its centre of mass."""
         dataset, synthesis = self.dataset, self.dataset.config["synthesis"]
-        start = opened(dataset.hand, grasp.joints.double(), self.protocol.motion.opening)
+        touching, field = grasp.touching, dataset.field(dataset.objects.names.index(item.name))
+        start = opened(dataset.hand, grasp.joints.double(), self.protocol.motion.opening, touching)
         base = inverse(pose.double()) @ grasp.pose.double()
-        closure = dataset.closer.close(dataset.field(dataset.objects.names.index(item.name)), base, start, centred=True)
-        torsion = torsion_of(len(dataset.hand.fingers), synthesis.get("torsion"))
-        about = (item.com, item.radius, synthesis["friction"], synthesis["edges"], torsion)
-        cones = wrenches(closure.contacts, closure.normals, *about)
-        return float(epsilon(cones)[0])
+        closure = dataset.closer.close(field, base, start, centred=True, touching=touching)
+        torsion = torsion_of(fewest_fingers(dataset.hand), synthesis.get("torsion"))
+        model = WrenchModel(tuple(item.com), item.radius, synthesis["friction"], synthesis["edges"], torsion)
+        return float(model.epsilon(closure.contacts, closure.normals).values[0])
 
 
 def _work(campaign: Campaign, index: int, label_ceilings: bool) -> tuple[Episode, dict[str, list[bool]]]:

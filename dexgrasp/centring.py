@@ -38,23 +38,31 @@ class Centring:
         self.apart, self.sources = _apart(self.body, self.groups) if self.groups else (self.body, np.zeros(0, int))
 
     def close(
-        self, field: Field, bases: np.ndarray, joints: np.ndarray, strict: bool = False, limit: float = np.inf
+        self,
+        field: Field,
+        bases: np.ndarray,
+        joints: np.ndarray,
+        strict: bool = False,
+        limit: float = np.inf,
+        touching: np.ndarray | None = None,
     ) -> Closed:
         """Close N hands object_T_base (N, 3, 4) from `joints` (N, J); see `close_fingers`.
 
         Returns the bases where the fingers touch together, then what `close_fingers` returns.
         """
         if not self.groups:
-            return bases, *close_fingers(self.body, field, bases, joints, False, strict, limit)
+            return bases, *close_fingers(self.body, field, bases, joints, False, strict, limit, touching)
+        chosen = np.ones((len(bases), len(self.body.rates)), bool) if touching is None else touching
         bases, start = bases.copy(), np.ascontiguousarray(joints[:, self.sources])
         rates = self.apart.rates @ self.apart.coupling.T
         begin = start @ self.apart.coupling.T + self.apart.offset
         times, away = np.full((len(bases), len(rates)), np.nan), np.zeros(len(bases))
-        rows, found = np.arange(len(bases)), close_fingers(self.apart, field, bases, start, False, strict, limit)
+        rows = np.arange(len(bases))
+        found = close_fingers(self.apart, field, bases, start, False, strict, limit, chosen)
         status, full, touches, on_tip, depth = found
         for number in range(ROUNDS):
             if number:  # only those whose fingers do not touch together yet
-                again = close_fingers(self.apart, field, bases[rows], start[rows], False, strict, limit)
+                again = close_fingers(self.apart, field, bases[rows], start[rows], False, strict, limit, chosen[rows])
                 for whole, part in zip(found, again, strict=True):
                     whole[rows] = part
             times[rows] = np.stack([_times(full[rows] - begin[rows], rate) for rate in rates], axis=1)
@@ -93,7 +101,8 @@ class Centring:
             far = np.linalg.norm(solved, axis=1) > FARTHEST
             shift[known] += np.where(far[:, None], 0.0, solved)
             spread = np.abs(times[:, group] - times[:, group].mean(axis=1, keepdims=True)) * np.stack(speeds, axis=1)
-            away = np.maximum(away, np.where(known, spread.max(axis=1), np.inf))
+            closed = np.isfinite(touches[:, group, 0]).any(axis=1)  # else none of them was to close
+            away = np.maximum(away, np.where(known, spread.max(axis=1), np.where(closed, np.inf, 0.0)))
         return shift, away
 
     def _speed(

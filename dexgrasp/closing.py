@@ -59,20 +59,22 @@ class Closer:
         joints: Float[Tensor, "N J"],
         breakaway: bool = False,
         centred: bool = False,
+        touching: Bool[Tensor, "N F"] | None = None,
     ) -> Closure:
         """Close hands at object_T_base `pose` (m) from the posture `joints`.
 
         With `breakaway`, links beyond one that touches go on until they touch themselves (BarrettHand's clutch).
         With `centred`, hands are first moved so that fingers which share a closing joint touch together; those that
-        cannot touch with no tip.
+        cannot touch with no tip. Fingers that are not `touching` do not close; None: all do.
         """
         base, start = as_arrays(pose, joints)
+        chosen = None if touching is None else touching.numpy()
         if centred and not breakaway:
             from dexgrasp.centring import Centring  # it closes with `close_fingers`
 
-            _, _, full, touches, on_tip, depth = Centring(self.hand).close(field.field, base, start)
+            _, _, full, touches, on_tip, depth = Centring(self.hand).close(field.field, base, start, touching=chosen)
         else:
-            found = close_fingers(self.body, field.field, base, start, breakaway, False, np.inf)
+            found = close_fingers(self.body, field.field, base, start, breakaway, False, np.inf, chosen)
             _, full, touches, on_tip, depth = found
         touches_t = torch.from_numpy(touches).to(pose)
         return Closure(
@@ -86,7 +88,6 @@ class Closer:
         )
 
 
-@njit(cache=True)
 def close_fingers(
     body: HandBody,
     field: Field,
@@ -95,12 +96,29 @@ def close_fingers(
     breakaway: bool,
     strict: bool,
     limit: float,
+    touching: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Close N hands; return status (N,), full joints (N, M), contact and normal (N, F, 6), on tip (N, F), depth (N,).
 
     With `strict`, a hand that starts deeper than `limit` (m) in the object, or one of whose fingers misses or does
-    not touch with its tip, is given up at once: its status says why and its depth is not measured.
+    not touch with its tip, is given up at once: its status says why and its depth is not measured. Only fingers that
+    are `touching` (N, F) close and are meant; None: all.
     """
+    chosen = np.ones((len(bases), len(body.tip_links)), np.bool_) if touching is None else touching
+    return _close_chosen(body, field, bases, joints, np.ascontiguousarray(chosen), breakaway, strict, limit)
+
+
+@njit(cache=True)
+def _close_chosen(
+    body: HandBody,
+    field: Field,
+    bases: np.ndarray,
+    joints: np.ndarray,
+    chosen: np.ndarray,
+    breakaway: bool,
+    strict: bool,
+    limit: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     count, fingers = len(bases), len(body.tip_links)
     status = np.zeros(count, np.int64)
     full = np.zeros((count, len(body.offset)))
@@ -110,7 +128,7 @@ def close_fingers(
     links, parts, joint_count = len(body.parents), len(body.part_links), len(body.offset)
     # The compiled code that is called gets all its arrays as arguments: only these may be borrowed there.
     _close(
-        body, field, bases, joints, breakaway, strict, limit,
+        body, field, bases, joints, chosen, breakaway, strict, limit,
         (status, full, touches, on_tip, depth),
         (np.empty((links, 3, 4)), np.empty(joint_count), np.zeros(fingers, np.bool_), np.zeros(links, np.bool_)),
         (np.zeros((parts, 3)), np.empty((MOST, 8)), np.empty(7), np.empty(7)),
@@ -125,6 +143,7 @@ def _close(
     field: Field,
     bases: np.ndarray,
     joints: np.ndarray,
+    chosen: np.ndarray,
     breakaway: bool,
     strict: bool,
     limit: float,
@@ -134,6 +153,7 @@ def _close(
     scratch: Scratch,
 ) -> None:
     body, field, bases, joints = borrowed(body), borrowed(field), borrowed(bases), borrowed(joints)
+    chosen = borrowed(chosen)
     status, full, touches, on_tip, depth = borrowed(results)
     poses, rate, done, free = borrowed(of_links)
     ways, found, hit, contact = borrowed(of_contacts)
@@ -144,7 +164,8 @@ def _close(
         if strict and deepest(body, field, poses, -limit, True) < -limit:
             status[i] = PENETRATES
             continue
-        done[:] = False
+        for finger in range(fingers):
+            done[finger] = not chosen[i, finger]
         free[:] = False
         ways[:] = 0.0
         for finger in range(fingers):

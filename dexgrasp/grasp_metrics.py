@@ -21,7 +21,8 @@ from dexgrasp.objects import Object
 from dexgrasp.seeds import stream
 from dexgrasp.simulation.protocol import Physics
 from dexgrasp.simulation.world import World
-from dexgrasp.wrench_model import torsion_of
+from dexgrasp.touching import fewest_fingers
+from dexgrasp.wrench_model import WrenchModel, torsion_of
 
 FRICTION, EDGES = 0.5, 8
 """Of the contacts' cones; torques about the centre of mass over the largest radius."""
@@ -37,7 +38,8 @@ BINS, CELL = 100, 0.02
 def closed(hand: Hand, field: DistanceField, grasps: Grasps) -> Grasps:
     """Return grasps (object frame) with the contacts at which their fingers end, opened a little and closed again."""
     grasps = grasps.to(torch.float64)
-    closure = Closer(hand).close(field, grasps.pose, opened(hand, grasps.joints, OPENING), centred=True)
+    start, touching = opened(hand, grasps.joints, OPENING, grasps.touching), grasps.touching
+    closure = Closer(hand).close(field, grasps.pose, start, centred=True, touching=touching)
     return grasps.replace(contacts=closure.contacts, normals=closure.normals)
 
 
@@ -48,17 +50,18 @@ def grasp_metrics(
 
     Of contacts after closing: `epsilon`, `epsilon_linf`, `volume`, `spread` (m), `centred` (m). Of the posture as
     told: `penetration` (deepest point of the hand in the object, m), `self_penetration` (deepest overlap of two of its
-    fingers, m), `contact_distance` (mean over fingertips' links, at most 1 cm, m), `contact_count` (links within 2 mm).
+    fingers, m), `contact_distance` (mean over links of the fingertips that
+    are to touch, at most 1 cm, m), `contact_count` (links within 2 mm).
     """
-    torsion = torsion_of(len(hand.fingers), None)
-    found = contact_metrics(grasps, item, FRICTION, EDGES, torsion)
+    torsion = torsion_of(fewest_fingers(hand), None)
+    found = contact_metrics(grasps, WrenchModel(tuple(item.com), item.radius, FRICTION, EDGES, torsion))
     links = shape.link_distances(field, grasps.pose, grasps.joints)
     names = [record.name for record in hand.tree]  # type: ignore[attr-defined]
     tips = [names.index(finger.link) for finger in hand.fingers]
     return found | {
         "penetration": (-links.min(dim=1).values).clamp(min=0.0),
         "self_penetration": self_penetration(hand, grasps, physics),
-        "contact_distance": links[:, tips].clamp(0.0, FAR).mean(dim=1),
+        "contact_distance": links[:, tips].clamp(0.0, FAR).where(grasps.touching, torch.nan).nanmean(dim=1),
         "contact_count": (links.abs() < NEAR).double().sum(dim=1),
     }
 

@@ -32,6 +32,8 @@ class Grasps(Batch):
     """Index of the object in its scene or set; -1 where unknown."""
     quality: Float[Tensor, "N"]
     """Epsilon quality of synthesised grasps; score (higher is better) of predicted ones."""
+    touching: Bool[Tensor, "N F"]
+    """Fingers that close until they touch; the others stay as `joints` tell them, open and out of the way."""
 
     @classmethod
     def build(
@@ -42,8 +44,9 @@ class Grasps(Batch):
         *,
         finger: Tensor | None = None,
         quality: Tensor | None = None,
+        touching: Tensor | None = None,
     ) -> "Grasps":
-        """Return grasps of which only pose and joints are known; contacts are NaN, object -1."""
+        """Return grasps of which only pose and joints are known; contacts are NaN, object -1, all fingers touching."""
         count = len(pose)
         unknown = pose.new_full((count, fingers, 3), float("nan"))
         none = torch.full((count,), -1, dtype=torch.long, device=pose.device)
@@ -55,6 +58,7 @@ class Grasps(Batch):
             finger=none if finger is None else finger,
             object=none.clone(),
             quality=pose.new_zeros(count) if quality is None else quality,
+            touching=torch.ones_like(unknown[..., 0], dtype=torch.bool) if touching is None else touching,
         )
 
     def moved(self, a_T_b: Float[Tensor, "4 4"]) -> "Grasps":

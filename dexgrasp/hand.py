@@ -59,6 +59,8 @@ class Hand(ABC):
     efforts: Float[Tensor, "J"]
     """Torque (N m) or force (N) limit of each independent joint, at that joint."""
     fingers: tuple[Finger, ...]
+    least_fingers: int = 2
+    """Fewest fingers that touch in a grasp, where nothing else is asked for; a hand with fewer uses all."""
     link_names: tuple[str, ...]
     base_T_palm: Float[Tensor, "4 4"]
     """Palm frame: origin on the palm's face, z = approach direction (towards the object)."""

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -162,9 +162,10 @@ def told_grasps(
     pose: Float[Tensor, "N 4 4"],
     joints: Float[Tensor, "N J"],
     score: Float[Tensor, "N"],
+    touching: Bool[Tensor, "N F"] | None = None,
 ) -> Grasps:
     """Return decoded grasps, whose contact with `finger` is the point; those of the other fingers are NaN."""
-    grasps = Grasps.build(pose, joints, len(hand.fingers), finger=finger, quality=score)
+    grasps = Grasps.build(pose, joints, len(hand.fingers), finger=finger, quality=score, touching=touching)
     touching = F.one_hot(finger, len(hand.fingers)).bool().unsqueeze(-1)
     return grasps.replace(
         contacts=torch.where(touching, points.unsqueeze(1), grasps.contacts),

@@ -39,15 +39,25 @@ class Preview:
         self.speeds = _tip_speeds(hand, self.body)
 
     def look(
-        self, field: DistanceField, bases: np.ndarray, joints: np.ndarray, limit: float
+        self,
+        field: DistanceField,
+        bases: np.ndarray,
+        joints: np.ndarray,
+        limit: float,
+        touching: np.ndarray | None = None,
+        least: int | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Look at hands object_T_base (N, 3, 4) with open fingers at joints (N, J).
 
         Returns how each look ended (N,): SEEN, BURIED where the open hand is deeper than `limit` (m) in the object,
-        MISSED where some fingertip meets nothing; the full joints (N, M) where the fingertips meet the object; and
-        contact points and outward normals (N, F, 6) there, object frame (m).
+        MISSED where fewer than `least` (None: all) of the fingertips that are `touching` (N, F; None: all) meet it; the
+        full joints (N, M) where the fingertips meet the object; and contact points and outward normals (N, F, 6)
+        there, object frame (m). Fingers that miss, or are not to touch, stay open, and their contacts are NaN.
         """
-        return _look(self.body, field.field, bases, joints, self.chains, self.speeds, limit)
+        shape = len(bases), len(self.chains)
+        chosen = np.ones(shape, np.bool_) if touching is None else np.ascontiguousarray(touching)
+        spare = np.zeros(len(bases), np.int64) if least is None else chosen.sum(axis=1) - least
+        return _look(self.body, field.field, bases, joints, chosen, spare, self.chains, self.speeds, limit)
 
 
 def _chains(body: HandBody) -> np.ndarray:
@@ -207,6 +217,8 @@ def _look(
     field: Field,
     bases: np.ndarray,
     joints: np.ndarray,
+    chosen: np.ndarray,
+    spare: np.ndarray,
     chains: np.ndarray,
     speeds: np.ndarray,
     limit: float,
@@ -217,7 +229,7 @@ def _look(
     status = np.zeros(count, np.int64)
     closed, touches = np.empty((count, movable)), np.full((count, fingers, 6), np.nan)
     _look_at(
-        body, grid, frame, bases, joints, chains, speeds, limit,
+        body, grid, frame, bases, joints, chosen, spare, chains, speeds, limit,
         (status, closed, touches), body.rates @ body.coupling.T,
         (np.empty(movable), np.empty(movable), np.empty((len(body.parents), 3, 4)), np.empty((fingers, 3))),
         np.empty(256, np.int64),
@@ -232,6 +244,8 @@ def _look_at(
     frame: np.ndarray,
     bases: np.ndarray,
     joints: np.ndarray,
+    chosen: np.ndarray,
+    spare: np.ndarray,
     chains: np.ndarray,
     speeds: np.ndarray,
     limit: float,
@@ -247,7 +261,7 @@ def _look_at(
         borrowed(bases),
         borrowed(joints),
     )
-    chains, rates, stack = borrowed(chains), borrowed(rates), borrowed(stack)
+    chains, rates, stack, chosen = borrowed(chains), borrowed(rates), borrowed(stack), borrowed(chosen)
     status, closed, touches = borrowed(results)
     start, full, poses, tips = borrowed(scratch)
     motions, balls, children, roots, centers = body.motions, body.balls, body.children, body.roots, body.tips
@@ -258,7 +272,10 @@ def _look_at(
         if _buried(balls, children, roots, grid, frame, poses, limit, stack):
             status[i] = BURIED
             continue
+        missing = 0
         for finger in range(fingers):
+            if not chosen[i, finger]:
+                continue
             above = int(motions[chains[finger, 0], 0])
             parent = poses[above] if above >= 0 else bases[i]
             rate, chain, center = rates[finger], chains[finger], centers[finger]
@@ -277,11 +294,16 @@ def _look_at(
                 tips[finger],
             )
             if not reached:
-                status[i] = MISSED
-                break
+                missing += 1
+                if missing > spare[i]:
+                    status[i] = MISSED
+                    break
+                tips[finger, 0] = np.nan
+                continue
             for m in range(movable):
                 if rate[m] != 0:
                     closed[i, m] = full[m]
         if status[i] == SEEN:
             for finger in range(fingers):
-                _foot(grid, frame, tips[finger], touches[i, finger])
+                if chosen[i, finger] and not np.isnan(tips[finger, 0]):
+                    _foot(grid, frame, tips[finger], touches[i, finger])

@@ -38,6 +38,7 @@ class UrdfHand(Hand):
             its own axis), `tip_radius` and `tip_center` (default: fitted from the link's mesh), `closing_axis`,
             `outer_joint` (link coordinates).
         shared: independent joints that are main joints of every finger.
+        least_fingers: fewest fingers that touch in a grasp.
         root: link at which the hand begins, where the URDF holds a whole arm; the base frame is its frame.
         palm: a link whose frame is the palm frame, or {origin, approach} in the base frame.
         couplings: {joint: {joint, multiplier (1), offset (0)}}, in place of `<mimic>` tags that are wrong or missing;
@@ -60,6 +61,7 @@ class UrdfHand(Hand):
         fingers: Sequence[Mapping[str, Any]],
         *,
         shared: Sequence[str] = (),
+        least_fingers: int = 2,
         root: str | None = None,
         palm: str | Mapping[str, Sequence[float]] | None = None,
         couplings: Mapping[str, Mapping[str, Any] | None] | None = None,
@@ -98,6 +100,11 @@ class UrdfHand(Hand):
         self.shared = tuple(joint for joint in self.joint_names if joint in shared)
         self.base_T_palm = self._palm(palm)
         self.fingers = tuple(self._finger(finger) for finger in fingers)
+        if not 2 <= least_fingers <= max(len(self.fingers), 2):
+            raise DexgraspError(
+                f"least_fingers of 2 to {len(self.fingers)}", repr(least_fingers), f"mend it in the YAML of {name!r}"
+            )
+        self.least_fingers = least_fingers
 
     def link_poses(self, joints: Float[Tensor, "N J"]) -> dict[str, Float[Tensor, "N 4 4"]]:
         """Return base_T_link of every link; differentiable, dtype and device of `joints`."""

@@ -1,10 +1,11 @@
 """What an epsilon is about, as one value that is stored with it: `WrenchModel`, and `Quality`, figures with theirs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from dexgrasp import quality
@@ -14,12 +15,14 @@ from dexgrasp.errors import DexgraspError
 Array = Tensor | np.ndarray
 HULLS = ("l1", "linf")
 TWO_FINGERS = 0.02
-"""Torsion of a hand with two fingers, m: hard contacts hold no torque about the line through them. As in `lift-v1`."""
+"""Torsion of a hand that grasps with two fingers, m: hard contacts hold no torque about the line through them. As in
+`lift-v1`. Its grasps with more fingers have it, too: else two soft fingers would seem better than four hard ones.
+"""
 
 
-def torsion_of(fingers: int, torsion: float | None) -> float:
-    """Return the torsion (m) of the contacts of a hand with so many fingers; `torsion` where it is given."""
-    return (TWO_FINGERS if fingers == 2 else 0.0) if torsion is None else torsion
+def torsion_of(least: int, torsion: float | None) -> float:
+    """Return the torsion (m) of a hand of which at least so many fingers touch; `torsion` where it is given."""
+    return (TWO_FINGERS if least == 2 else 0.0) if torsion is None else torsion
 
 
 @dataclass(frozen=True)
@@ -71,20 +74,48 @@ class WrenchModel:
         )
 
     def epsilon(self, contacts: Array, normals: Array, threshold: float | None = None) -> "Quality":
-        """Return exact epsilon (N,) with this model; below a threshold it may be told as 0, which is faster."""
-        found = quality.epsilon(self.wrenches(contacts, normals), threshold, self._summed(contacts))
-        return Quality(found, self, "epsilon", threshold)
+        """Return exact epsilon (N,) with this model; below a threshold it may be told as 0, which is faster.
+
+        Here and below, contacts of NaN are of fingers that do not touch, and the figure is of the others alone.
+        """
+
+        def figure(points: Array, outward: Array) -> Array:
+            return quality.epsilon(self.wrenches(points, outward), threshold, self._summed(points))
+
+        return Quality(_by_number(figure, contacts, normals), self, "epsilon", threshold)
 
     def reaches(self, contacts: Array, normals: Array, threshold: float) -> Array:
         """Return whether epsilon >= threshold (N,): the fastest filter."""
-        return quality.reaches(self.wrenches(contacts, normals), threshold, self._summed(contacts))
+
+        def figure(points: Array, outward: Array) -> Array:
+            return quality.reaches(self.wrenches(points, outward), threshold, self._summed(points))
+
+        return _by_number(figure, contacts, normals) > 0
 
     def volume(self, contacts: Array, normals: Array) -> "Quality":
         """Return the volume (N,) of the wrench hull with this model."""
-        return Quality(quality.volume(self.wrenches(contacts, normals), self._summed(contacts)), self, "volume")
+
+        def figure(points: Array, outward: Array) -> Array:
+            return quality.volume(self.wrenches(points, outward), self._summed(points))
+
+        return Quality(_by_number(figure, contacts, normals), self, "volume")
 
     def _summed(self, contacts: Array) -> int:
         return contacts.shape[1] if self.hull == "linf" else 0
+
+
+def _by_number(figure: Callable[[Array, Array], Array], contacts: Array, normals: Array) -> Array:
+    """Return a figure (N,) of the contacts (N, F, 3) that are not NaN, all grasps with equally many at once."""
+    touched = ~(torch.as_tensor(contacts) + torch.as_tensor(normals)).isnan().any(dim=-1).cpu().numpy()
+    if touched.all():
+        return figure(contacts, normals)
+    first, number = np.argsort(~touched, axis=1, kind="stable"), touched.sum(axis=1)
+    result = np.zeros(len(contacts))
+    for size in np.unique(number[number > 0]).tolist():
+        rows = np.flatnonzero(number == size)
+        chosen = rows[:, None], first[rows, :size]
+        result[rows] = torch.as_tensor(figure(contacts[chosen], normals[chosen])).cpu().numpy()
+    return result if isinstance(contacts, np.ndarray) else torch.from_numpy(result).to(contacts)
 
 
 @dataclass(frozen=True, eq=False)

@@ -179,8 +179,8 @@ def test_slots_are_main_then_supporting(contact, toy_hand):
     for row, finger in enumerate(toy_hand.fingers):
         names = finger.main + finger.supporting
         assert names[0] == "spread", "shared joints are main for every finger"
-        torch.testing.assert_close(parameters[row, 2:], grasps.joints[row, toy_hand.joint_index(names)])
-    assert contact.size == 2 + 6
+        torch.testing.assert_close(parameters[row, 2 : 2 + len(names)], grasps.joints[row, toy_hand.joint_index(names)])
+    assert contact.size == 2 + 6 + 3, "and which fingers touch"
 
 
 def test_a_moved_scene_moves_the_decoded_grasps(contact, toy_hand):

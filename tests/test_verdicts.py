@@ -23,6 +23,7 @@ from dexgrasp.objects import Object
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import load_protocol
 from dexgrasp.statistics import roc_area, roc_curve
+from dexgrasp.wrench_model import WrenchModel
 
 Composed = Callable[..., DictConfig]
 
@@ -77,7 +78,7 @@ def test_metrics_of_a_symmetric_grasp(hand, plate) -> None:
     contacts = torch.tensor([[[0.0, 0.03, 0.0], [0.01, -0.03, 0.0], [-0.01, -0.03, 0.0]]])
     normals = torch.tensor([[[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, -1.0, 0.0]]])
     grasps = from_above(np.zeros(1)).replace(contacts=contacts.double(), normals=normals.double())
-    told = metrics(grasps, plate, 0.5, 8)
+    told = metrics(grasps, WrenchModel(tuple(plate.com), plate.radius))
     assert float(told["centred"][0]) == pytest.approx(-0.01, abs=1e-9)
     assert 0.0 < float(told["epsilon"][0]) <= float(told["epsilon_linf"][0])
     assert float(told["volume"][0]) > 0 and 0.01 < float(told["spread"][0]) < 0.04

@@ -155,7 +155,9 @@ class Dataset:
 
     def _grasps(self, index: int) -> Grasps:
         """Return all grasps of object `index`, in its frame."""
-        return Grasps(**self.store("grasps")[index].tensors)
+        tensors = self.store("grasps")[index].tensors
+        every = torch.ones(tensors["contacts"].shape[:2], dtype=torch.bool)  # stores of older versions do not say
+        return Grasps(**{"touching": every, **tensors})
 
     def reasons(self, index: int) -> Int[Tensor, "N"]:
         """Return what became in physics of each grasp of object `index`: a `Reason`, 0 where it lifted, -1 untested."""

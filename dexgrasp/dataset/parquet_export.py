@@ -21,6 +21,7 @@ MEANING = {
     "joints": "rad (m where prismatic), in the order of the metadata's `joints`",
     "contacts": "of each fingertip in the object's frame: x, y, z, m, finger by finger",
     "normals": "outward of the object there, unit",
+    "touching": "whether each finger closes until it touches; the others stay open, their contacts are NaN",
     "finger": "from which the grasp is told",
     "quality": "epsilon (Ferrari and Canny): see the metadata's `quality`",
     "scene": "number of the scene",
@@ -50,7 +51,7 @@ def export_parquet(dataset: Dataset, folder: Path) -> list[Path]:
         "joints": ", ".join(dataset.hand.joint_names),
         "units": "m, rad",
         "quality": f"torque about the centre of mass / largest distance to the surface, friction "
-        f"{synthesis['friction']}, {synthesis['edges']} cone edges, unit normal forces",
+        f"{synthesis['friction']}, {synthesis['edges']} cone edges, unit normal forces of the fingers that touch",
         "seed": str(dataset.config["seed"]),
     }
     written = [_write(folder / "grasps.parquet", _grasps(dataset), metadata)]
@@ -73,6 +74,7 @@ def _grasps(dataset: Dataset) -> Iterator[dict[str, Any]]:
             "joints": tensors["joints"],
             "contacts": tensors["contacts"].reshape(count, -1),
             "normals": tensors["normals"].reshape(count, -1),
+            "touching": tensors["touching"],
             "finger": tensors["finger"].astype(np.int8),
             "quality": tensors["quality"],
         }

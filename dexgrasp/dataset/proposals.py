@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dexgrasp.batch import Batch
@@ -24,6 +24,8 @@ TURN = 0.085
 """How far a varied finger projection moves."""
 SHIFT, ROLL = 0.006, 0.15
 """How far a varied palm moves along the normal, m, and turns about it, rad."""
+EXCHANGE = 0.1
+"""Share of varied draws whose fingers are drawn anew."""
 SLOWEST, FASTEST = 0.15, 0.85
 """A finger's contact is drawn with its closing joints between these parts of their ranges."""
 
@@ -44,13 +46,17 @@ class Draws(Batch):
     """`contact`: finger projection x, y. `approach`: depth (m), roll (rad)."""
     joints: Float[Tensor, "N J"]
     """`contact`: the posture in which the finger touches. `approach`: the open posture."""
+    touching: Bool[Tensor, "N F"]
+    """Fingers that are to close; the others stay open."""
 
 
 class Proposer(ABC):
     """One way of proposing hands for an object."""
 
-    def __init__(self, hand: Hand) -> None:
+    def __init__(self, hand: Hand, sets: Bool[Tensor, "S F"] | None = None) -> None:
+        """Of `sets` of fingers that are to touch, those of every size are drawn alike; None: all fingers."""
         self.hand = hand
+        self.sets = torch.ones(1, len(hand.fingers), dtype=torch.bool) if sets is None else sets
 
     @abstractmethod
     def draw(self, surface: Surface, count: int, rng: np.random.Generator) -> Draws:
@@ -64,12 +70,32 @@ class Proposer(ABC):
     def hands(self, surface: Surface, draws: Draws) -> tuple[Float[Tensor, "N 4 4"], Float[Tensor, "N J"]]:
         """Return object_T_base (m) and joints with open fingers."""
 
+    def _fingers(self, finger: Int[Tensor, "N"], rng: np.random.Generator) -> Bool[Tensor, "N F"]:
+        """Draw which fingers are to touch, among them `finger` (-1: any): every number of fingers as often."""
+        if len(self.sets) == 1:
+            return self.sets.repeat(len(finger), 1)
+        drawn = torch.empty(len(finger), self.sets.shape[1], dtype=torch.bool)
+        for one in finger.unique().tolist():
+            able = self.sets if one < 0 else self.sets[self.sets[:, one]]
+            size = able.sum(dim=1).numpy()
+            weight = 1.0 / np.bincount(size)[size]
+            rows = (finger == one).nonzero().flatten()
+            drawn[rows] = able[torch.from_numpy(rng.choice(len(able), size=len(rows), p=weight / weight.sum()))]
+        return drawn
+
+    def _exchanged(self, parents: Draws, rng: np.random.Generator) -> Bool[Tensor, "N F"]:
+        """Return the parents' fingers, a few of them drawn anew."""
+        if len(self.sets) == 1:
+            return parents.touching
+        again = torch.from_numpy(rng.uniform(size=(len(parents), 1)) < EXCHANGE)
+        return torch.where(again, self._fingers(parents.finger, rng), parents.touching)
+
 
 class Approach(Proposer):
     """The palm looks along a surface normal: depth x in-plane rotation x spread (the paper's way)."""
 
-    def __init__(self, hand: Hand) -> None:
-        super().__init__(hand)
+    def __init__(self, hand: Hand, sets: Bool[Tensor, "S F"] | None = None) -> None:
+        super().__init__(hand, sets)
         self.reach = _reach(hand)
 
     def draw(self, surface: Surface, count: int, rng: np.random.Generator) -> Draws:
@@ -77,7 +103,8 @@ class Approach(Proposer):
         unit = torch.from_numpy(_strata(rng, count, 2))
         place = torch.stack([0.005 + (self.reach - 0.005) * unit[:, 0], 2 * math.pi * unit[:, 1]], dim=1)
         joints = opened(self.hand, _uniform(self.hand, rng, count))
-        return Draws(_points(surface, count, rng), torch.full((count,), -1), place, joints)
+        finger = torch.full((count,), -1)
+        return Draws(_points(surface, count, rng), finger, place, joints, self._fingers(finger, rng))
 
     def vary(self, surface: Surface, parents: Draws, step: float, rng: np.random.Generator) -> Draws:
         """See `Proposer.vary`."""
@@ -86,6 +113,7 @@ class Approach(Proposer):
             point=_wandered(surface, parents, step, rng),
             place=parents.place + noise,
             joints=_stirred(self.hand, parents, step, rng),
+            touching=self._exchanged(parents, rng),
         )
         return moved.replace(joints=opened(self.hand, moved.joints))
 
@@ -116,13 +144,16 @@ class Contact(Proposer):
         angle, z = 2 * math.pi * unit[:, :1], 0.05 + 0.95 * unit[:, 1:]  # uniform z: uniform on the sphere
         xy = torch.sqrt(1 - z**2) * torch.cat([torch.cos(angle), torch.sin(angle)], dim=1)
         finger = torch.from_numpy(rng.permutation(count) % len(self.hand.fingers))
-        return Draws(_points(surface, count, rng), finger, xy, joints)
+        return Draws(_points(surface, count, rng), finger, xy, joints, self._fingers(finger, rng))
 
     def vary(self, surface: Surface, parents: Draws, step: float, rng: np.random.Generator) -> Draws:
         """See `Proposer.vary`."""
         xy = to_disc(parents.place + torch.from_numpy(rng.normal(scale=step * TURN, size=(len(parents), 2))))
         return parents.replace(
-            point=_wandered(surface, parents, step, rng), place=xy, joints=_stirred(self.hand, parents, step, rng)
+            point=_wandered(surface, parents, step, rng),
+            place=xy,
+            joints=_stirred(self.hand, parents, step, rng),
+            touching=self._exchanged(parents, rng),
         )
 
     def hands(self, surface: Surface, draws: Draws) -> tuple[Float[Tensor, "N 4 4"], Float[Tensor, "N J"]]:

@@ -10,17 +10,19 @@ from torch import Tensor
 from dexgrasp.centring import Centring
 from dexgrasp.closing import CLOSED, MISSES, OFF_TIP, PENETRATES
 from dexgrasp.collision import HandShape, as_arrays
+from dexgrasp.dataset.open_fingers import OpenFingers
 from dexgrasp.dataset.proposals import Approach, Contact, Draws
 from dexgrasp.dataset.spread import distinct, regions, spread
 from dexgrasp.dataset.surface import Surface
 from dexgrasp.dataset.synthesis_settings import SynthesisSettings
-from dexgrasp.execution import closing_direction, pregrasp
+from dexgrasp.execution import closing_directions, pregrasp
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.hand_body import hand_body
 from dexgrasp.headroom import headroom
 from dexgrasp.objects import Object
 from dexgrasp.preview import BURIED, MISSED, SEEN, Preview
+from dexgrasp.touching import closing_groups, fewest_fingers, finger_sets
 from dexgrasp.wrench_model import WrenchModel, torsion_of
 
 PASS = 1.0
@@ -52,12 +54,17 @@ class Search:
         self.hand, self.item, self.surface, self.settings = hand, item, surface, settings
         self.body, self.shape, self.preview = hand_body(hand), HandShape(hand), Preview(hand)
         self.centring = Centring(hand)
-        torsion = torsion_of(len(hand.fingers), settings.torsion)
+        torsion = torsion_of(fewest_fingers(hand), settings.torsion)
         self.model = WrenchModel(tuple(item.com), item.radius, settings.friction, settings.edges, torsion)
-        share = settings.approach
+        share, sets = settings.approach, finger_sets(hand, settings.least_fingers, settings.most_fingers)
+        self.least = int(sets.sum(dim=1).min())
+        groups = np.array(closing_groups(hand))
+        self.joined = [np.flatnonzero(groups == group) for group in range(groups.max() + 1)]
+        """Fingers that share a closing joint."""
+        self.open_fingers = OpenFingers(self.shape)
         self.proposers = [
             (palm, proposer, part)
-            for palm, proposer, part in ((False, Contact(hand), 1 - share), (True, Approach(hand), share))
+            for palm, proposer, part in ((False, Contact(hand, sets), 1 - share), (True, Approach(hand, sets), share))
             if part > 0
         ]
         self.rejected: Counter[str] = Counter()
@@ -70,8 +77,9 @@ class Search:
         """Largest epsilon that a preview promised."""
         joints = len(hand.joint_names)
         self.grasps = Grasps.build(torch.zeros(0, 4, 4).double(), torch.zeros(0, joints).double(), len(hand.fingers))
+        none = torch.zeros(0).long()
         self.draws = Draws(
-            torch.zeros(0).long(), torch.zeros(0).long(), torch.zeros(0, 2).double(), torch.zeros(0, joints).double()
+            none, none, torch.zeros(0, 2).double(), torch.zeros(0, joints).double(), self.grasps.touching
         )
         """What led to `grasps`."""
         self.promising, self.promise = self.draws, torch.zeros(0).double()
@@ -111,8 +119,8 @@ class Search:
             rows = (drawn.finger < 0) == palm
             pose[rows], start[rows] = proposer.hands(self.surface, drawn[rows])
         before, known = self.valid, len(self.grasps)
-        likely = self._look(drawn, pose, start)
-        self._close(drawn[likely], pose[likely], start[likely])
+        likely, touching = self._look(drawn, pose, start)
+        self._close(drawn[likely], pose[likely], start[likely], touching)
         # Steps as large as they may be while enough lead to grasps, and none so small that they lead to known ones.
         valid = self.valid - before
         longer = valid > YIELD * len(drawn) or len(self.grasps) - known < NEW * valid
@@ -135,15 +143,22 @@ class Search:
             if further:
                 # Regions alike, however many grasps they hold: the search spreads to where there are few.
                 weight = 1.0 / np.bincount(region[own])[region[own]]
+                number = parents.touching[own].sum(dim=1).numpy()
+                if np.ptp(number):  # and numbers of fingers alike
+                    weight /= np.bincount(number, weights=weight)[number]
                 chosen = own[rng.choice(len(own), size=further, p=weight / weight.sum())]
                 drawn.append(proposer.vary(self.surface, parents[torch.from_numpy(chosen)], self.step, rng))
         return Draws.cat(drawn)
 
-    def _look(self, drawn: Draws, pose: Float[Tensor, "N 4 4"], start: Float[Tensor, "N J"]) -> Int[Tensor, "K"]:
-        """Return which hands are worth closing."""
+    def _look(
+        self, drawn: Draws, pose: Float[Tensor, "N 4 4"], start: Float[Tensor, "N J"]
+    ) -> tuple[Int[Tensor, "K"], Bool[Tensor, "K F"]]:
+        """Return which hands are worth closing, and with which fingers: those that would touch."""
         settings = self.settings
         field_ = self.surface.field
-        status, full, touches = self.preview.look(field_, *as_arrays(pose, start), settings.penetration)
+        hands = *as_arrays(pose, start), settings.penetration, drawn.touching.numpy(), self.least
+        status, full, touches = self.preview.look(field_, *hands)
+        self._join(status, touches)
         for code, reason in ((BURIED, "penetrates"), (MISSED, "finger misses")):
             self.rejected[reason] += int((status == code).sum())
         seen = np.flatnonzero(status == SEEN)
@@ -161,16 +176,26 @@ class Search:
             good = np.asarray(self.model.reaches(contacts, normals, least))
         self.rejected["quality"] += int((~good).sum())
         seen, quality = seen[good], quality[good]
-        closed = torch.from_numpy(full[seen][:, self.body.leaders])
-        waiting = self.hand.clamp(closed - settings.opening * closing_direction(self.hand))
+        closed, touching = torch.from_numpy(full[seen][:, self.body.leaders]), _touched(touches[seen])
+        waiting = self.hand.clamp(closed - settings.opening * closing_directions(self.hand, touching))
         free = self._above_table(pose[seen], [closed, waiting], self._sought, SLACK).any(dim=1).numpy()
         self.rejected["under the table"] += int((~free).sum())
         seen, quality = seen[free], quality[free]
         if self.few:
-            self._promise(drawn[torch.from_numpy(seen)], torch.from_numpy(quality))
+            promising = drawn[torch.from_numpy(seen)].replace(touching=_touched(touches[seen]))
+            self._promise(promising, torch.from_numpy(quality))
             self.rejected["quality"] += int((quality < PASS * settings.epsilon).sum())
             seen = seen[quality >= PASS * settings.epsilon]
-        return torch.from_numpy(seen)
+        return torch.from_numpy(seen), _touched(touches[seen])
+
+    def _join(self, status: np.ndarray, touches: np.ndarray) -> None:
+        """Let go of touches of fingers that share a closing joint with one that misses, and of hands with too few."""
+        for group in self.joined:
+            if len(group) > 1:
+                missed = np.isnan(touches[:, group, 0]).any(axis=1)
+                touches[np.ix_(missed, group)] = np.nan
+        if max(map(len, self.joined)) > 1:
+            status[(status == SEEN) & (np.isfinite(touches[..., 0]).sum(axis=1) < self.least)] = MISSED
 
     def _promise(self, drawn: Draws, quality: Float[Tensor, "N"]) -> None:
         both, quality = Draws.cat([self.promising, drawn]), torch.cat([self.promise, quality])
@@ -179,10 +204,12 @@ class Search:
         self.promising, self.promise = both[order], quality[order]
         self.best = max([self.best, *self.promise[:1].tolist()])
 
-    def _close(self, drawn: Draws, pose: Float[Tensor, "N 4 4"], start: Float[Tensor, "N J"]) -> None:
+    def _close(
+        self, drawn: Draws, pose: Float[Tensor, "N 4 4"], start: Float[Tensor, "N J"], touching: Bool[Tensor, "N F"]
+    ) -> None:
         settings, body = self.settings, self.body
         bases, status, full, touches, _, _ = self.centring.close(
-            self.surface.field.field, *as_arrays(pose, start), True, settings.penetration
+            self.surface.field.field, *as_arrays(pose, start), True, settings.penetration, touching.numpy()
         )
         pose = pose.clone()
         pose[:, :3] = torch.from_numpy(bases)
@@ -197,17 +224,20 @@ class Search:
         good, quality = good[quality >= settings.epsilon], quality[quality >= settings.epsilon]
         contacts, normals = torch.from_numpy(touches[good]).split(3, dim=-1)
         grasps = Grasps.build(pose[good], torch.from_numpy(full[good][:, body.leaders]), contacts.shape[1])
-        grasps = grasps.replace(contacts=contacts, normals=normals, quality=torch.from_numpy(quality))
+        grasps = grasps.replace(
+            contacts=contacts, normals=normals, quality=torch.from_numpy(quality), touching=touching[good]
+        )
         _, waiting = pregrasp(self.hand, grasps, settings.retreat, settings.opening)
         folded = self.shape.self_collision(grasps.joints) | self.shape.self_collision(waiting)
         clear = self.shape.approach_clear(self.surface.field, grasps.pose, waiting, settings.retreat, settings.overlap)
         free = self._above_table(grasps.pose, [grasps.joints, waiting])
+        clear &= self.open_fingers.clear(self.surface.field, grasps)
         fine = ~folded & clear & free.any(dim=1)
         self.rejected["hand touches itself"] += int(folded.sum())
         self.rejected["way is blocked"] += int((~folded & ~clear).sum())
         self.rejected["under the table"] += int((~folded & clear & ~fine).sum())
         self.valid += int(fine.sum())
-        self._keep(grasps[fine], drawn[good][fine], free[fine])
+        self._keep(grasps[fine], drawn[good][fine].replace(touching=grasps.touching[fine]), free[fine])
 
     def _above_table(
         self,
@@ -229,9 +259,9 @@ class Search:
         rows = np.arange(len(drawn))
         finger = drawn.finger.numpy()
         touch = touches[rows, finger]
-        far = np.linalg.norm(touch[:, :3] - self.surface.points[drawn.point].numpy(), axis=1) > away
-        apart = np.linalg.norm(touch[:, 3:] - self.surface.normals[drawn.point].numpy(), axis=1) > turned
-        return (finger < 0) | ~(far | apart)
+        near = np.linalg.norm(touch[:, :3] - self.surface.points[drawn.point].numpy(), axis=1) <= away
+        alike = np.linalg.norm(touch[:, 3:] - self.surface.normals[drawn.point].numpy(), axis=1) <= turned
+        return (finger < 0) | (near & alike)
 
     def _keep(self, grasps: Grasps, drawn: Draws, free: Bool[Tensor, "N K"]) -> None:
         settings = self.settings
@@ -241,8 +271,16 @@ class Search:
         self.grasps, self.draws, self.free = both[first], draws[first], torch.cat([self.free, free])[first]
 
     def chosen(self) -> Grasps:
-        """Return the target's number of grasps, best spread: first what each resting pose is to have."""
+        """Return the target's number of grasps, best spread: first what each resting pose is to have.
+
+        Of every number of fingers as far as there are so many, and of k of them k^2 parts: more fingers hold better.
+        """
         order = spread(self.grasps)
+        number = self.grasps.touching[order].sum(dim=1)
+        turn = torch.zeros(len(order), dtype=torch.float64)
+        for each in number.unique().tolist():
+            turn[number == each] = torch.arange(int((number == each).sum())).double() / each**2
+        order = order[turn.argsort(stable=True)]
         rank = self.free[order].cumsum(dim=0)
         serves = (self.free[order] & (rank <= self.wanted)).any(dim=1)
         chosen = torch.cat([serves.nonzero().flatten(), (~serves).nonzero().flatten()])
@@ -255,6 +293,10 @@ class Search:
         reasons = ", ".join(f"{reason}: {count}" for reason, count in self.rejected.most_common() if count)
         best = f"; the best epsilon in sight was {self.best:.3f}, wanted is {self.settings.epsilon:g}"
         return f"none of {self.candidates} candidates on {self.item.name} is a grasp ({reasons}{best})"
+
+
+def _touched(touches: Float[np.ndarray, "N F 6"]) -> Bool[Tensor, "N F"]:
+    return torch.from_numpy(np.isfinite(touches[..., 0]))
 
 
 def _resting(item: Object, share: float | None) -> tuple[Float[Tensor, "K 4 4"], Float[Tensor, "K"]]:

@@ -17,6 +17,8 @@ REGION, TURN = 0.015, 0.5
 """Grasps are of one region whose contacts' means and approach axes fall into one cell, m and of a unit vector."""
 NEAR, ALIGNED = 0.005, math.radians(20)
 """A surface point is reached by a contact this near, m, whose normal is this near, rad: what labels it (METHOD 2)."""
+SPARED = 0x9E3779B97F4A7C1
+"""Grasps with fewer fingers are of other regions: an odd number that moves their keys."""
 ROOM = 0.001
 """A fingertip can touch where it would be at most this deep in the object, m."""
 DIRECTIONS = 200
@@ -44,8 +46,9 @@ def distinct(grasps: Grasps, hand: Hand, position: float, angle: float, joints: 
 
 
 def regions(grasps: Grasps) -> Int[np.ndarray, "N"]:
-    """Return the number of each grasp's region: where on the object, and from which side."""
+    """Return the number of each grasp's region: where on the object, from which side, and with how many fingers."""
     cells = _keys(torch.cat([grasps.contacts.nanmean(dim=1) / REGION, grasps.pose[:, :3, 2] / TURN], dim=1))
+    cells ^= (~grasps.touching).sum(dim=1).numpy() * SPARED
     return np.unique(cells, return_inverse=True)[1].reshape(-1)
 
 

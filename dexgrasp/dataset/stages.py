@@ -32,7 +32,8 @@ from dexgrasp.seeds import stream
 from dexgrasp.settings import read
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import load_protocol
-from dexgrasp.wrench_model import torsion_of
+from dexgrasp.touching import fewest_fingers
+from dexgrasp.wrench_model import WrenchModel, torsion_of
 
 
 def key(index: int) -> str:
@@ -68,7 +69,8 @@ def make_scene(dataset: Dataset, index: int) -> Item:
         draw = stream(config["seed"], "scene grasps", index, row).permutation(len(usable))[: settings.grasps_per_object]
         chosen.append(usable[torch.from_numpy(draw)])
         pose, joints = scene.poses[row] @ grasps.pose[chosen[-1]].double(), grasps.joints[chosen[-1]].double()
-        world = Grasps.build(pose, joints, len(dataset.hand.fingers))
+        touching = grasps.touching[chosen[-1]]
+        world = Grasps.build(pose, joints, len(dataset.hand.fingers), touching=touching)
         tried.append(world.replace(object=torch.full((len(draw),), row)))
     grasps = Grasps.cat(tried)
     obstacles = [dataset.field(number) for number in numbers]
@@ -106,8 +108,9 @@ def make_verdicts(dataset: Dataset, index: int) -> Item:
     rng = stream(dataset.config["seed"], "verdicts", item.name)
     found = verify(dataset.hand, dataset.shape, item, grasps, settings.verify, settings.approach, rng)
     synthesis = settings.synthesis
-    torsion = torsion_of(len(dataset.hand.fingers), synthesis.torsion)
-    told = metrics(grasps[found.grasp], item, synthesis.friction, synthesis.edges, torsion)
+    torsion = torsion_of(fewest_fingers(dataset.hand), synthesis.torsion)
+    model = WrenchModel(tuple(item.com), item.radius, synthesis.friction, synthesis.edges, torsion)
+    told = metrics(grasps[found.grasp], model)
     tensors = found.tensors() | {METRIC + name: value.float() for name, value in told.items()}
     facts = {"name": item.name, "grasps": len(grasps)} | signature(settings.verify.rules) | tally(found.reason)
     return Item(key(index), tensors, facts)

@@ -45,6 +45,8 @@ class Summary:
     surface: float = 0.0
     directions: float = 0.0
     """What those kept reach, see `dexgrasp.dataset.spread.Coverage`."""
+    fingers: dict[str, int] = field(default_factory=dict)
+    """How many of those kept touch with so many fingers."""
     model: dict[str, Any] = field(default_factory=dict)
     """What `quality` is about, see `dexgrasp.wrench_model.WrenchModel`; torque origin in the object's frame."""
     note: str = ""
@@ -54,9 +56,10 @@ class Summary:
 def synthesize(hand: Hand, item: Object, settings: SynthesisSettings, seed: int) -> tuple[Grasps, Summary]:
     """Return grasps of one object in its own frame (float64), best spread first, and what became of the candidates.
 
-    Every finger touches with its tip, nothing overlaps by more than `penetration`, epsilon is at least
-    `settings.epsilon`, and hand and object stay apart on the straight way back with the fingers opened. `finger` is
-    the one whose contact tells the pose best (METHOD section 1). The same seed gives the same grasps.
+    The fingers that `touching` names touch with their tips, the others are open and clear of the object; nothing
+    overlaps by more than `penetration`, epsilon is at least `settings.epsilon`, and hand and object stay apart on the
+    straight way back with the fingers opened. `finger` is the one whose contact tells the pose best (METHOD section 1).
+    The same seed gives the same grasps.
     """
     body = DistanceField.build(item.mesh)
     surface = Surface.sample(item, body, settings.spacing, stream(seed, "surface", item.name))
@@ -80,15 +83,22 @@ def synthesize(hand: Hand, item: Object, settings: SynthesisSettings, seed: int)
         exact=exact,
         surface=reached.surface,
         directions=reached.directions,
+        fingers=by_fingers(found),
         model=search.model.as_dict(),
         note=search.note(),
     )
 
 
+def by_fingers(grasps: Grasps) -> dict[str, int]:
+    """Return how many grasps touch with so many fingers, fewest first."""
+    numbers, counts = grasps.touching.sum(dim=1).unique(return_counts=True)
+    return {str(number): count for number, count in zip(numbers.tolist(), counts.tolist(), strict=True)}
+
+
 def tell(hand: Hand, grasps: Grasps) -> tuple[Grasps, Float[Tensor, "N"]]:
     """Choose for each grasp the finger whose contact tells its pose best; return it told so, and what is lost (m)."""
     best = torch.full((len(grasps),), torch.inf, dtype=torch.float64)
-    finger = torch.zeros_like(grasps.finger)
+    finger = grasps.touching.int().argmax(dim=1)
     for number in range(len(hand.fingers)):
         which = torch.full((len(grasps),), number)
         points, normals = grasps.contacts[:, number], grasps.normals[:, number]

@@ -12,6 +12,8 @@ class SynthesisSettings:
     friction: float = 0.5
     edges: int = 8
     torsion: float | None = None
+    least_fingers: int | None = None
+    most_fingers: int | None = None
     epsilon: float = 0.05
     penetration: float = 0.001
     approach: float = 0.15
@@ -31,6 +33,13 @@ class SynthesisSettings:
     near_joints: float = 0.2
 
     def __post_init__(self) -> None:
+        low, high = self.least_fingers, self.most_fingers
+        if min(2 if low is None else low, 2 if high is None else high) < 2 or (low and high and low > high):
+            raise DexgraspError(
+                "least_fingers and most_fingers of 2 or more, in order, or null",
+                f"{low} and {high}",
+                "correct the group `synthesis`",
+            )
         if min(self.batch, self.rounds, self.patience, self.target) < 1 or not (
             0 <= self.approach <= 1 and 0 <= self.varied <= 1
         ):

@@ -14,8 +14,8 @@ from dexgrasp.distance import DistanceField
 from dexgrasp.execution import opened
 from dexgrasp.geometry import inverse, rotation_angle
 from dexgrasp.grasps import Grasps
-from dexgrasp.quality import epsilon, wrenches
-from dexgrasp.wrench_model import torsion_of
+from dexgrasp.touching import fewest_fingers
+from dexgrasp.wrench_model import WrenchModel, torsion_of
 
 if TYPE_CHECKING:
     from dexgrasp.closing import Closer, Closure
@@ -125,29 +125,30 @@ class Truth:
             rows, body = (grasps.object == number).nonzero().flatten(), self.bodies[number]
             closure = self._closed(grasps[rows], number)
             touched[rows] = closure.touched.sum(dim=1)
-            found = torch.as_tensor(epsilon(self._cones(closure.contacts, closure.normals, body))).to(quality)
+            found = torch.as_tensor(self._model(body).epsilon(closure.contacts, closure.normals).values).to(quality)
             quality[rows] = torch.where(closure.penetration <= limits.penetration, found, 0.0)
         return free, touched, quality
 
     def _closed(self, grasps: Grasps, index: int) -> "Closure":
-        start = opened(self.closer.hand, grasps.joints.double(), self.settings.opening)
-        motion = self.object_T_frame[index]
-        return self.closer.close(self.bodies[index].field, motion @ grasps.pose.double(), start, centred=True)
+        touching = grasps.touching
+        start = opened(self.closer.hand, grasps.joints.double(), self.settings.opening, touching)
+        pose = self.object_T_frame[index] @ grasps.pose.double()
+        return self.closer.close(self.bodies[index].field, pose, start, centred=True, touching=touching)
 
-    def _cones(self, contacts: Float[Tensor, "N F 3"], normals: Float[Tensor, "N F 3"], body: Body) -> Tensor:
+    def _model(self, body: Body) -> WrenchModel:
         limits = self.settings
-        torsion = torsion_of(contacts.shape[1], limits.torsion)
-        found = wrenches(contacts, normals, body.com, body.radius, limits.friction, limits.edges, torsion)
-        return torch.as_tensor(found)
+        torsion = torsion_of(fewest_fingers(self.closer.hand), limits.torsion)
+        return WrenchModel(tuple(body.com), body.radius, limits.friction, limits.edges, torsion)
 
     def _closed_quality(self, grasps: Grasps, index: int) -> Float[Tensor, "N"]:
         """Return epsilon of grasps of one object after closing again; 0 where a check fails."""
         limits, body = self.settings, self.bodies[index]
         closure = self._closed(grasps, index)
-        good = (closure.touched & closure.on_tip).all(dim=1) & (closure.penetration <= limits.penetration)
+        good = ((closure.touched & closure.on_tip) | ~grasps.touching).all(dim=1)
+        good &= closure.penetration <= limits.penetration
         quality = grasps.quality.new_zeros(len(grasps))
         if good.any():
             contacts, normals = closure.contacts[good].double(), closure.normals[good].double()
-            cones = self._cones(contacts, normals, body)
-            quality[good] = torch.as_tensor(epsilon(cones, threshold=limits.epsilon)).to(quality)
+            found = self._model(body).epsilon(contacts, normals, limits.epsilon).values
+            quality[good] = torch.as_tensor(found).to(quality)
         return quality

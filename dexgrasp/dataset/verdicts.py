@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -19,11 +19,11 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.grasps import Grasps, Outcomes, Reason
 from dexgrasp.hand import Hand
 from dexgrasp.objects import Object
-from dexgrasp.quality import epsilon, volume, wrenches
 from dexgrasp.scene import Boxes
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import Protocol, load_protocol
 from dexgrasp.statistics import roc_area, roc_curve, wilson
+from dexgrasp.wrench_model import WrenchModel
 
 UNTESTED = -1
 """In place of a `Reason` where a grasp was not tested."""
@@ -155,25 +155,22 @@ def at_rest(item: Object, simulator: MujocoSimulator) -> tuple[Float[Tensor, "K 
     return found[still], torch.from_numpy(likelihood[order].copy())[still]
 
 
-def metrics(
-    grasps: Grasps, item: Object, friction: float, edges: int, torsion: float = 0.0
-) -> dict[str, Float[Tensor, "N"]]:
+def metrics(grasps: Grasps, model: WrenchModel) -> dict[str, Float[Tensor, "N"]]:
     """Return what is known of grasps (object frame) without physics; of all of them more should be better.
 
     `epsilon` and `volume` are of the L1 hull, `epsilon_linf` of the L-infinity hull (METHOD section 5); `spread` is
-    the contacts' mean distance from their centroid, `centred` minus the centroid's from the centre of mass, both m
-    (NaN where no finger touches).
+    the contacts' mean distance from their centroid, `centred` minus the centroid's from the centre of mass, both m.
+    All are of the contacts of the fingers that touch (lengths are NaN where none does); `model` has the centre of mass
+    as its origin.
     """
     contacts, normals = grasps.contacts.double(), grasps.normals.double()
-    cones = wrenches(contacts, normals, item.com, item.radius, friction, edges, torsion)
-    fingers = contacts.shape[1]
     middle = contacts.nanmean(dim=1)
-    offset = torch.linalg.vector_norm(middle - torch.as_tensor(item.com, dtype=torch.float64), dim=1)
+    offset = torch.linalg.vector_norm(middle - torch.tensor(model.origin, dtype=torch.float64), dim=1)
     spread = torch.linalg.vector_norm(contacts - middle[:, None], dim=-1).nanmean(dim=1)
     return {
-        "epsilon": torch.as_tensor(epsilon(cones)),
-        "epsilon_linf": torch.as_tensor(epsilon(cones, contacts=fingers)),
-        "volume": torch.as_tensor(volume(cones)),
+        "epsilon": torch.as_tensor(model.epsilon(contacts, normals).values),
+        "epsilon_linf": torch.as_tensor(replace(model, hull="linf").epsilon(contacts, normals).values),
+        "volume": torch.as_tensor(model.volume(contacts, normals).values),
         "spread": spread,
         "centred": -offset,
     }

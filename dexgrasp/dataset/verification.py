@@ -14,9 +14,9 @@ from dexgrasp.dataset.store import Store
 from dexgrasp.errors import DexgraspError
 from dexgrasp.execution import opened
 from dexgrasp.grasps import Grasps
-from dexgrasp.quality import epsilon, wrenches
 from dexgrasp.seeds import stream
-from dexgrasp.wrench_model import torsion_of
+from dexgrasp.touching import fewest_fingers
+from dexgrasp.wrench_model import WrenchModel, torsion_of
 
 SCHEMAS: dict[str, dict[str, tuple[str | int, ...]]] = {
     "objects": {"vertices": ("v", 3), "faces": ("f", 3), "com": (3,), "size": (2,), "stable_poses": ("k", 4, 4)},
@@ -96,7 +96,7 @@ def rechecked(dataset: Dataset, grasps: int, scenes: int, seed: int = 0) -> Iter
 
 def _grasps(dataset: Dataset, count: int, seed: int) -> Iterator[Check]:
     settings = stages.settings_of(dataset).synthesis
-    torsion = torsion_of(len(dataset.hand.fingers), settings.torsion)
+    torsion = torsion_of(fewest_fingers(dataset.hand), settings.torsion)
     kept = np.array([len(dataset.grasps(i)) for i in range(len(dataset.store("grasps")))])
     if not kept.sum():
         yield Check("grasps", True, "none are there")
@@ -108,15 +108,15 @@ def _grasps(dataset: Dataset, count: int, seed: int) -> Iterator[Check]:
         own = dataset.grasps(int(number))[torch.from_numpy(drawn[owner == number] - (kept.cumsum() - kept)[number])]
         own = own.to(torch.float64)
         body = dataset.body(int(number))
-        cones = wrenches(own.contacts, own.normals, body.com, body.radius, settings.friction, settings.edges, torsion)
-        errors.append((torch.as_tensor(epsilon(cones)) - own.quality).abs())
+        model = WrenchModel(tuple(body.com), body.radius, settings.friction, settings.edges, torsion)
+        errors.append((torch.as_tensor(model.epsilon(own.contacts, own.normals).values) - own.quality).abs())
         least.append(own.quality)
-        start = opened(dataset.hand, own.joints, settings.opening)
-        closure = dataset.closer.close(body.field, own.pose, start, centred=True)
+        start = opened(dataset.hand, own.joints, settings.opening, own.touching)
+        closure = dataset.closer.close(body.field, own.pose, start, centred=True, touching=own.touching)
         depths.append(closure.penetration)
-        away = torch.linalg.vector_norm(closure.contacts - own.contacts, dim=-1)
-        moved.append(away.nan_to_num(nan=torch.inf).max(dim=1).values)
-        closed.append((closure.touched & closure.on_tip).all(dim=1))
+        away = torch.linalg.vector_norm(closure.contacts - own.contacts, dim=-1).nan_to_num(nan=torch.inf)
+        moved.append(torch.where(own.touching, away, 0.0).max(dim=1).values)
+        closed.append(((closure.touched & closure.on_tip) | ~own.touching).all(dim=1))
     error, depth, away = (torch.cat(values) for values in (errors, depths, moved))
     quality, shut = torch.cat(least), torch.cat(closed)
     total = f"of {len(error)} grasps"

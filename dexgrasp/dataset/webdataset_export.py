@@ -23,7 +23,8 @@ FRAMES = {
     "instance.npy": "(N,) int16, object of the scene; -1 table and background",
     "camera.npy": "(4, 4) world_T_camera, m; world: z up, table at z = 0",
     "grasps.npz": "feasible grasps of the scene, camera frame: pose (G, 4, 4) camera_T_base, joints (G, J) rad, "
-    "contacts (G, F, 3) m, normals (G, F, 3), finger (G,), object (G,) as instance, quality (G,) epsilon",
+    "contacts (G, F, 3) m, normals (G, F, 3), NaN where a finger does not touch, finger (G,), object (G,) as instance, "
+    "quality (G,) epsilon, touching (G, F) which fingers close",
     "labels.npz": "where the dataset has labels: as dexgrasp.dataset.labels.Labels",
     "json": "scene, names of its objects",
 }

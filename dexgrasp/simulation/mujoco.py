@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dexgrasp.execution import closing_direction, pregrasp, tilted
+from dexgrasp.execution import closing_directions, pregrasp, tilted
 from dexgrasp.grasps import Grasps, Outcomes, Reason
 from dexgrasp.hand import Hand
 from dexgrasp.objects import Object
@@ -75,13 +75,13 @@ class MujocoSimulator(Simulator):
         before = pregrasp(hand, grasps, protocol.motion.retreat, protocol.motion.opening)
         start_pose, start_joints = (part.detach().numpy() for part in before)
         pose, joints = grasps.pose.detach().numpy(), hand.clamp(grasps.joints).detach().numpy()
-        direction = closing_direction(hand).numpy()
+        direction = closing_directions(hand, grasps.touching).numpy()
         results, kind = [], Attempt if protocol.disturbance is None else DisturbedAttempt
         for n in range(len(grasps)):
             if skipped[n]:
                 results.append(Result(Reason.NO_GRASP, -1, 0.0, initial))
                 continue
-            plan = Plan(start_pose[n], start_joints[n], pose[n], joints[n], direction)
+            plan = Plan(start_pose[n], start_joints[n], pose[n], joints[n], direction[n])
             aim = -1 if target is None else int(target[n])
             results.append(kind(world, initial, plan, protocol, aim).run())
         return _outcomes(results, len(objects), poses)

@@ -11,6 +11,7 @@ from dexgrasp.grasps import Grasps
 from dexgrasp.representation import Prediction, Representation, Targets
 from dexgrasp.testing import samples
 from dexgrasp.testing.law import expect, expect_close
+from dexgrasp.touching import finger_sets
 
 COUNT = 64
 
@@ -42,6 +43,37 @@ def decode_of_encode_is_the_identity(representation: Representation) -> None:
     _expect_same(back, grasps[told], representation, "decode(as_prediction(encode(grasps))) to be the grasps")
     expect(
         torch.equal(back.finger, grasps.finger[told]), "the finger to come back", back.finger[:8].tolist(), "an offset"
+    )
+
+
+def which_fingers_touch_comes_back(representation: Representation) -> None:
+    """A grasp that leaves some fingers open comes back with the same fingers open, or is not encodable."""
+    hand = representation.hand
+    points, normals, grasps = samples.grasps(hand, COUNT, seed=40)
+    grasps = grasps.replace(touching=samples.touching(hand, grasps.finger))
+    targets = representation.encode(points, normals, grasps)
+    expect(
+        bool(targets.parameters.isfinite().all()), "finite parameters", targets.parameters, "a contact of NaN was read"
+    )
+    told = targets.encodable
+    back = representation.decode(points[told], normals[told], representation.as_prediction(targets[told]))
+    wrong = (back.touching != grasps.touching[told]).any(dim=1)
+    expect(
+        not bool(wrong.any()),
+        "fingers that do not touch to come back as such, or the grasp not to be encodable",
+        f"{int(wrong.sum())} of {len(wrong)} grasps with other fingers",
+        "`grasps.touching` is not told: tell it (dexgrasp.touching), or let `encodable` be False where it is not all",
+    )
+    _expect_same(back, grasps[told], representation, "grasps that leave fingers open to come back")
+    guess = {name: torch.zeros_like(value) for name, value in representation.as_prediction(targets).items()}
+    found = representation.decode(points, normals, guess)
+    able = {tuple(row) for row in finger_sets(hand).tolist()}
+    expect(
+        all(tuple(row) in able for row in found.touching.tolist())
+        and bool(found.touching[torch.arange(COUNT), found.finger].all()),
+        "decoded fingers that the hand can grasp with, the telling one among them, whatever is predicted",
+        found.touching[:4].tolist(),
+        "choose among `dexgrasp.touching.finger_sets`",
     )
 
 
@@ -172,6 +204,8 @@ def _targets(representation: Representation) -> Targets:
     """Targets of encodable grasps from every finger and of as many points that are not graspable."""
     points, normals, grasps = samples.grasps(representation.hand, COUNT, seed=30)
     told = representation.encode(points, normals, grasps)
+    fewer = grasps.replace(touching=samples.touching(representation.hand, grasps.finger))
+    told = Targets.cat([told, representation.encode(points, normals, fewer)])
     told = told[told.encodable]
     none = told.replace(finger=torch.zeros_like(told.finger), quality=torch.zeros_like(told.quality))
     return Targets.cat([told, none])
@@ -188,6 +222,7 @@ def _channels(representation: Representation) -> int:
 
 LAWS: tuple[Callable[[Representation], None], ...] = (
     decode_of_encode_is_the_identity,
+    which_fingers_touch_comes_back,
     grasps_move_with_the_scene,
     truth_has_the_least_loss,
     gradients_reach_every_parameter,

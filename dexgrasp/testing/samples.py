@@ -1,13 +1,14 @@
 """Random joints, grasps and clouds that the laws are tried on."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from dexgrasp import geometry
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
+from dexgrasp.touching import finger_sets
 
 
 def joints(hand: Hand, count: int, seed: int = 0) -> Float[Tensor, "N J"]:
@@ -48,6 +49,13 @@ def grasps(hand: Hand, count: int, seed: int = 0, lean: float = 0.0) -> Told:
     points = tip[:, :3, 3] - radius.unsqueeze(-1) * normals
     quality = torch.rand(count, generator=generator, dtype=torch.float64)
     return points, normals, Grasps.build(pose, posture, len(hand.fingers), finger=finger, quality=quality)
+
+
+def touching(hand: Hand, finger: Int[Tensor, "N"]) -> Bool[Tensor, "N F"]:
+    """Return sets of fingers that the hand can grasp with, in turn, each with the finger from which a grasp is told."""
+    sets = finger_sets(hand)
+    able = [sets[sets[:, one]] for one in range(len(hand.fingers))]
+    return torch.stack([able[one][row % len(able[one])] for row, one in enumerate(finger.tolist())])
 
 
 def cloud(batch: int, points: int, seed: int = 0) -> Float[Tensor, "B N 6"]:

@@ -44,7 +44,7 @@ class Direct(Representation):
             finger=grasps.finger + 1,  # 0 is for points that are not graspable
             parameters=torch.cat([offset, columns, joints], dim=1),
             quality=grasps.quality,
-            encodable=grasps.finger >= 0,
+            encodable=(grasps.finger >= 0) & grasps.touching.all(dim=1),  # which fingers touch is not told
         )
 
     def decode(self, points: Tensor, normals: Tensor, prediction: Prediction) -> Grasps:

@@ -26,6 +26,7 @@ from dexgrasp.heads import (
     told_grasps,
 )
 from dexgrasp.representation import Prediction, Representation, Targets
+from dexgrasp.touching import fingers_as_prediction, fingers_loss, told_fingers, told_size
 
 OWN, SHARED, SUPPORTING = range(3)
 """What a joint slot of a finger is."""
@@ -35,6 +36,9 @@ FEWEST = 16
 
 class Contact(Representation):
     """Parameters: x, y, then joint angles in slots: the touching finger's main joints, then its supporting ones.
+
+    Of a hand that grasps with some of its fingers, too, which of them touch follows: 1 or 0 each. The joints of a
+    finger that does not touch are told like all others: it stays as they say, open and out of the way.
 
     What a slot means depends on the finger (paper: theta_ms, theta_m, theta_s1, theta_s2); each keeps the hand's
     order. Three stages (paper, figure 3): which finger touches, if any; projection and main joints; supporting
@@ -56,7 +60,7 @@ class Contact(Representation):
             one grasp.
         hidden: widths of the hidden layers of each MLP, one per head.
         bins, shared_bins, joint_bins: see `JointBins`.
-        alpha, beta, gamma: weights of finger identity, finger projection and joints.
+        alpha, beta, gamma, delta: weights of finger identity, finger projection, joints, and which fingers touch.
         gamma_m, gamma_ms, gamma_s: weights of the finger's own main joints, of main joints that all fingers share
             (spread), and of supporting joints.
         none_weight, focal: see `finger_loss`.
@@ -82,6 +86,7 @@ class Contact(Representation):
         alpha: float = 1.0,
         beta: float = 5.0,
         gamma: float = 5.0,
+        delta: float = 1.0,
         gamma_m: float = 1.0,
         gamma_ms: float = 1.0,
         gamma_s: float = 1.0,
@@ -91,12 +96,13 @@ class Contact(Representation):
     ) -> None:
         super().__init__()
         self.hand, self.refine = hand, refine
-        self.alpha, self.beta, self.gamma = alpha, beta, gamma
+        self.alpha, self.beta, self.gamma, self.delta = alpha, beta, gamma, delta
         self.gammas = {"main": gamma_m, "shared": gamma_ms, "supporting": gamma_s}
         self.none_weight, self.focal, self.huber = none_weight, focal, huber
         self.joints = JointBins(hand, bins=bins, shared=shared_bins, by_joint=joint_bins)
         order = torch.tensor([hand.joint_index(f.main + f.supporting) for f in hand.fingers])
-        self.size = 2 + order.shape[1]
+        self.fingers = told_size(hand)
+        self.size = 2 + order.shape[1] + self.fingers
 
         # A joint slot is told in stage 2 if it is a main joint of any finger; slots that never move have no head.
         told = (self.joints.count[order] > 0).any(dim=0)
@@ -121,9 +127,10 @@ class Contact(Representation):
         fingers, each = len(hand.fingers), 2 * self.joints.most * self.versions
         self.slots = {"shared": self.first_slots, "own": self.second_slots, "supporting": self.supporting_slots}
         sizes = {"finger": fingers + 1, "projection": 3 * anchors * self.versions}
+        sizes |= {"touching": self.fingers * self.versions} if self.fingers else {}
         sizes |= {name: each * len(slots) for name, slots in self.slots.items()}
         # What each head sees of those before it, beside the features.
-        decided = {"finger": fingers, "projection": anchors}
+        decided = {"finger": fingers, "projection": anchors} | ({"touching": fingers} if self.fingers else {})
         decided |= {name: self.joints.most * len(slots) for name, slots in self.slots.items()}
         known = [sum(list(decided.values())[:number]) if conditioned else 0 for number in range(len(sizes))]
         known[-1] = known[-1] + sum(list(sizes.values())[:-1]) if refine else 0
@@ -137,15 +144,18 @@ class Contact(Representation):
     def encode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grasps: Grasps) -> Targets:
         """Tell N grasps; `encodable` is False where z <= 0, or where no finger was chosen (then `finger` is 0).
 
+        And where a finger does not touch of a hand that grasps with all of them (`Hand.least_fingers`).
         Lossy where the normal leaves the flexion plane: decode to see what is left of the grasp.
         """
         grasps = grasps.to(points)
         finger = grasps.finger.clamp(min=0)
         xy, encodable = project(self.hand, finger, points, normals, grasps.pose, grasps.joints)
         slots = grasps.joints.gather(-1, self.order[finger])
+        if not self.fingers:
+            encodable = encodable & grasps.touching.all(dim=-1)
         return Targets(
             finger=grasps.finger + 1,
-            parameters=torch.cat([xy, slots], dim=-1),
+            parameters=torch.cat([xy, slots, grasps.touching[:, : self.fingers].to(xy)], dim=-1),
             quality=grasps.quality,
             encodable=encodable & (grasps.finger >= 0),
         )
@@ -164,13 +174,15 @@ class Contact(Representation):
         joints = torch.empty_like(slots).scatter(-1, joint, slots)
         xy = self._told_xy(outputs["projection"], outputs["projection"][..., 0].argmax(-1))
         base = place(self.hand, finger, points, normals, xy, joints)
-        return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0])
+        touching = told_fingers(self.hand, outputs.get("touching"), finger)
+        return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0], touching)
 
     def forward(self, features: Float[Tensor, "N C"], truth: Targets | None = None, choice: int = 0) -> Prediction:
         """Run the three stages; `choice` takes another than the likeliest anchor, the less likely the higher it is.
 
         Returns finger (N, F + 1) logits, projection (N, V, anchors, 3): logit and offset of (x, y), main and supporting
-        (N, V, slots, 2, bins): logits and residuals. V is F with `per_finger`, else 1.
+        (N, V, slots, 2, bins): logits and residuals, touching (N, V, F) logits where fingers may be left out. V is F
+        with `per_finger`, else 1.
         """
         outputs = self.stages["finger"](features)
         if truth is None:
@@ -194,12 +206,13 @@ class Contact(Representation):
         known = [F.one_hot(finger, len(self.hand.fingers)).to(features)]
         raw = {"finger": classes}
         shaped: Prediction = {}
-        for name in ("projection", *self.slots):
+        for name in list(self.stages)[1:]:
             seen = [features, *(known if self.conditioned else [])]
             if name == "supporting":
                 seen = [*seen, *raw.values()] if self.refine else [features]
             raw |= self.stages[name](torch.cat(seen, dim=-1))
-            shape = (len(self.anchors), 3) if name == "projection" else (len(self.slots[name]), 2, self.joints.most)
+            shapes = {"projection": (len(self.anchors), 3), "touching": (self.fingers,)}
+            shape = shapes[name] if name in shapes else (len(self.slots[name]), 2, self.joints.most)
             shaped[name] = raw[name].unflatten(-1, (self.versions, *shape))
             if name == "projection" and choice:
                 shaped[name] = _without_likeliest(shaped[name], choice)
@@ -207,7 +220,7 @@ class Contact(Representation):
                 known.append(self._decided(name, shaped[name], finger, truth))
         position = [(self.first_slots + self.second_slots).index(slot) for slot in self.main_slots]
         return {
-            "projection": shaped["projection"],
+            **{name: shaped[name] for name in ("projection", "touching") if name in shaped},
             "main": torch.cat([shaped["shared"], shaped["own"]], dim=2)[:, :, position],
             "supporting": shaped["supporting"],
         }
@@ -222,6 +235,11 @@ class Contact(Representation):
             true = chosen if truth is None else self._anchor(truth.parameters[:, :2])
             chosen = chosen if truth is None else torch.where(truth.finger > 0, true, chosen)
             return F.one_hot(chosen, len(self.anchors)).to(outputs)
+        if name == "touching":
+            told = told_fingers(self.hand, own, finger)
+            true = told if truth is None else truth.parameters[:, -self.fingers :] > 0.5
+            known = (finger < 0) if truth is None else truth.finger > 0
+            return torch.where(known.unsqueeze(-1), true, told).to(outputs)
         slots = self.slots[name]
         if not slots:
             return own.new_zeros(len(own), 0)
@@ -242,7 +260,7 @@ class Contact(Representation):
         return self.anchors[anchor, :2].to(offset) + offset
 
     def loss(self, prediction: Prediction, targets: Targets) -> dict[str, Tensor]:
-        """Return METHOD section 2's terms: finger, projection, main, shared, supporting.
+        """Return METHOD section 2's terms: finger, projection, main, shared, supporting; and touching, where told.
 
         The projection's is |xy_p - xy_l| from the true anchor, and cross-entropy on the anchor where there are several.
         Points that are graspable but not encodable count nowhere; all terms but the first count contact points only.
@@ -263,6 +281,9 @@ class Contact(Representation):
         terms = {"finger": self.alpha * classes, "projection": self.beta * mean(projection)}
         for index, (name, weight) in enumerate(self.gammas.items()):
             terms[name] = self.gamma * weight * mean(joints * (kind == index))
+        if self.fingers:
+            touching = fingers_loss(outputs["touching"], truth[:, -self.fingers :], finger)
+            terms["touching"] = self.delta * mean(touching)
         return terms
 
     def as_prediction(self, targets: Targets) -> Prediction:
@@ -277,6 +298,8 @@ class Contact(Representation):
         for name, slots in (("main", self.main_slots), ("supporting", self.supporting_slots)):
             told = self.joints.as_prediction(targets.parameters[:, 2:][:, slots], self.order[finger][:, slots])
             outputs[name] = torch.stack(told, dim=-2)
+        if self.fingers:
+            outputs["touching"] = fingers_as_prediction(targets.parameters[:, -self.fingers :])
         return {"finger": classes} | every_finger(outputs, self.versions)
 
     def _joint_outputs(self, outputs: Prediction) -> tuple[Tensor, Tensor]:

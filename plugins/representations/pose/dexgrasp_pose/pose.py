@@ -24,10 +24,14 @@ from dexgrasp.heads import (
     told_grasps,
 )
 from dexgrasp.representation import Prediction, Representation, Targets
+from dexgrasp.touching import fingers_as_prediction, fingers_loss, told_fingers, told_size
 
 
 class Pose(Representation):
     """Parameters: offset from the point to the base (3, in units of `scale`), rotation (6), joints in the hand's order.
+
+    Of a hand that grasps with some of its fingers, too, which of them touch follows: 1 or 0 each. The joints of a
+    finger that does not touch are told like all others.
 
     The rotation is told by the first two columns of frame_R_base (Zhou et al. 2019, "On the continuity of rotation
     representations"), made orthonormal by Gram-Schmidt. Lossless: every grasp can be told from every point. The
@@ -41,7 +45,8 @@ class Pose(Representation):
         hidden: widths of the hidden layers of each MLP.
         separate_heads: an MLP for each output; else all but the finger's share hidden layers.
         bins, shared_bins, joint_bins: see `JointBins`.
-        alpha, beta_offset, beta_rotation, gamma: weights of finger identity, offset, rotation and joints.
+        alpha, beta_offset, beta_rotation, gamma, delta: weights of finger identity, offset, rotation, joints, and which
+            fingers touch.
         none_weight, focal: see `finger_loss`.
         huber: residual (in bins) at which the residual's loss turns from quadratic to linear.
     """
@@ -65,6 +70,7 @@ class Pose(Representation):
         beta_offset: float = 5.0,
         beta_rotation: float = 5.0,
         gamma: float = 5.0,
+        delta: float = 1.0,
         none_weight: float = 1.0,
         focal: float = 0.0,
         huber: float = 1.0,
@@ -72,26 +78,33 @@ class Pose(Representation):
         super().__init__()
         self.hand, self.scale = hand, scale
         self.alpha, self.beta_offset, self.beta_rotation, self.gamma = alpha, beta_offset, beta_rotation, gamma
+        self.delta = delta
         self.none_weight, self.focal, self.huber = none_weight, focal, huber
         self.joints = JointBins(hand, bins=bins, shared=shared_bins, by_joint=joint_bins)
         self.told = torch.nonzero(self.joints.count).flatten().tolist()
-        self.size = 9 + len(hand.joint_names)
+        self.fingers = told_size(hand)
+        self.size = 9 + len(hand.joint_names) + self.fingers
         self.versions = len(hand.fingers) if per_finger else 1
         self.shapes = {"offset": (3,), "rotation": (6,), "joints": (len(self.told), 2, self.joints.most)}
+        self.shapes |= {"touching": (self.fingers,)} if self.fingers else {}
         sizes = {name: self.versions * math.prod(shape) for name, shape in self.shapes.items()}
         self.stage_1 = Heads(channels, {"finger": len(hand.fingers) + 1}, hidden, separate=separate_heads)
         self.stage_2 = Heads(channels, sizes, hidden, separate=separate_heads)
 
     def encode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grasps: Grasps) -> Targets:
-        """Tell N grasps; `encodable` is False only where no finger was chosen (then `finger` is 0)."""
+        """Tell N grasps; `encodable` is False only where no finger was chosen (then `finger` is 0).
+
+        And where a finger does not touch of a hand that grasps with all of them (`Hand.least_fingers`).
+        """
         grasps = grasps.to(points)
         offset = (grasps.pose[:, :3, 3] - points) / self.scale
         columns = grasps.pose[:, :3, :2].transpose(-1, -2).flatten(1)
+        touching = grasps.touching[:, : self.fingers].to(offset)
         return Targets(
             finger=grasps.finger + 1,
-            parameters=torch.cat([offset, columns, grasps.joints], dim=-1),
+            parameters=torch.cat([offset, columns, grasps.joints, touching], dim=-1),
             quality=grasps.quality,
-            encodable=grasps.finger >= 0,
+            encodable=(grasps.finger >= 0) & (grasps.touching.all(dim=-1) | bool(self.fingers)),
         )
 
     def decode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], prediction: Prediction) -> Grasps:
@@ -106,19 +119,24 @@ class Pose(Representation):
         joints[:, self.told] = self.joints.join(logits, residuals, joint)
         rotation = _orthonormal(outputs["rotation"])
         base = geometry.pose(rotation, points + self.scale * outputs["offset"])
-        return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0])
+        touching = told_fingers(self.hand, outputs.get("touching"), finger)
+        return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0], touching)
 
     def forward(self, features: Float[Tensor, "N C"], truth: Targets | None = None, choice: int = 0) -> Prediction:
         """Return finger (N, F + 1) logits, offset (N, V, 3), rotation (N, V, 6), joints (N, V, slots, 2, bins).
 
-        V is F with `per_finger`, else 1; bins are logits, then residuals. No head builds on another's answer.
+        V is F with `per_finger`, else 1; bins are logits, then residuals. Where told, touching (N, V, F) logits. No
+        head builds on another's answer.
         """
         told = self.stage_2(features)
         shaped = {name: told[name].unflatten(-1, (self.versions, *shape)) for name, shape in self.shapes.items()}
         return self.stage_1(features) | shaped
 
     def loss(self, prediction: Prediction, targets: Targets) -> dict[str, Tensor]:
-        """Return the terms finger, offset, rotation and joints; all but the first count contact points only."""
+        """Return the terms finger, offset, rotation, joints and, where told, touching.
+
+        All but the first count contact points only.
+        """
         known, contact = known_points(targets), contact_points(targets)
         classes = finger_loss(
             prediction["finger"][known], targets.finger[known], none_weight=self.none_weight, focal=self.focal
@@ -126,17 +144,22 @@ class Pose(Representation):
         truth = targets.parameters[contact]
         joint = torch.tensor(self.told, device=truth.device).expand(len(truth), -1)
         rows = {name: value[contact] for name, value in prediction.items()}
-        outputs = of_finger(rows, targets.finger[contact] - 1)
+        finger = targets.finger[contact] - 1
+        outputs = of_finger(rows, finger)
         logits, residuals = outputs["joints"].unbind(-2)
         joints = self.joints.loss(logits, residuals, truth[:, 9:][:, self.told], joint, huber=self.huber)
         offset = torch.linalg.vector_norm(outputs["offset"].to(truth) - truth[:, :3], dim=-1)
         rotation = torch.linalg.vector_norm(outputs["rotation"].to(truth) - truth[:, 3:9], dim=-1)
-        return {
+        terms = {
             "finger": self.alpha * classes,
             "offset": self.beta_offset * mean(offset),
             "rotation": self.beta_rotation * mean(rotation),
             "joints": self.gamma * mean(joints),
         }
+        if self.fingers:
+            touching = fingers_loss(outputs["touching"], truth[:, -self.fingers :], finger)
+            terms["touching"] = self.delta * mean(touching)
+        return terms
 
     def as_prediction(self, targets: Targets) -> Prediction:
         """Return what a perfect network would put out."""
@@ -147,6 +170,8 @@ class Pose(Representation):
             "rotation": targets.parameters[:, 3:9],
             "joints": torch.stack(self.joints.as_prediction(angles, joint), dim=-2),
         }
+        if self.fingers:
+            outputs["touching"] = fingers_as_prediction(targets.parameters[:, -self.fingers :])
         finger = CERTAIN * F.one_hot(targets.finger, len(self.hand.fingers) + 1).to(targets.parameters)
         return {"finger": finger} | every_finger(outputs, self.versions)
 
