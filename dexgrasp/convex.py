@@ -2,9 +2,12 @@
 
 import hashlib
 import os
+import subprocess
+import sys
 import tempfile
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -16,6 +19,25 @@ VERSION = 1
 """Part of the cache key: raise it when the decomposition changes."""
 FACES = 3000
 """The decomposition works on a mesh simplified to this many faces: its time grows with them, its accuracy hardly."""
+
+
+CHILD = """
+import resource, sys
+path, seconds = sys.argv[1], int(sys.argv[2])
+resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+import coacd, numpy
+stored = dict(numpy.load(path))
+coacd.set_log_level("off")
+options = eval(sys.argv[3])
+parts = coacd.run_coacd(coacd.Mesh(stored["vertices"], stored["faces"]), **options)
+points = [numpy.asarray(points, dtype=float) for points, _ in parts]
+numpy.savez(path, points=numpy.vstack(points), cuts=numpy.cumsum([len(each) for each in points])[:-1])
+"""
+"""A decomposition in a process of its own, which can be ended: `path` of an npz, seconds of processor time, options."""
+
+
+class Slow(Exception):
+    """A decomposition that took longer than it may."""
 
 
 def cache_folder() -> Path:
@@ -31,34 +53,51 @@ def mesh_hash(mesh: trimesh.Trimesh) -> str:
     return digest.hexdigest()
 
 
-def convex_parts(mesh: trimesh.Trimesh, threshold: float = 0.005) -> tuple[trimesh.Trimesh, ...]:
+def convex_parts(
+    mesh: trimesh.Trimesh, threshold: float = 0.005, seconds: int | None = None
+) -> tuple[trimesh.Trimesh, ...]:
     """Return convex bodies (m, at most 64 vertices each) that cover a watertight mesh (Wei et al. 2022, CoACD).
 
     `threshold` (m) is twice the depth of the dents that a part may fill, nearly; at least 2 % of the extent is taken.
     A mesh that fills 97 % of its hull is one part. The result is cached; same mesh and threshold, same parts.
+    Raises Slow after so many `seconds` of processor time; None waits.
     """
     key = f"{mesh_hash(mesh)}-{threshold:g}-{FACES}-v{VERSION}"
     path = cache_folder() / "convex" / f"{key}.npz"
     found = _read(path)
     if found is None:
-        found = _decompose(mesh, threshold)
+        found = _decompose(mesh, threshold, seconds)
         _write(path, found)
     return tuple(trimesh.convex.convex_hull(points) for points in found)
 
 
-def _decompose(mesh: trimesh.Trimesh, threshold: float) -> list[Array]:
+def _decompose(mesh: trimesh.Trimesh, threshold: float, seconds: int | None) -> list[Array]:
     hull = mesh.convex_hull
     if mesh.is_watertight and mesh.volume > 0.97 * hull.volume:
         return [_at_most_64(np.asarray(hull.vertices))]
+    vertices, faces = _simplified(mesh)
+    depth = max(threshold, 0.02 * float(mesh.extents.max()))
+    options: dict[str, Any] = {"threshold": depth, "real_metric": True, "seed": 0, "resolution": 500,
+               "mcts_iterations": 15, "mcts_nodes": 8, "mcts_max_depth": 2}  # fmt: skip
+    if seconds is not None:
+        return [_at_most_64(points) for points in _limited(vertices, faces, options, seconds) if len(points) > 3]
     import coacd  # loads a large library: only when a mesh is not in the cache
 
     coacd.set_log_level("error")
-    vertices, faces = _simplified(mesh)
-    depth = max(threshold, 0.02 * float(mesh.extents.max()))
-    options = {"threshold": depth, "real_metric": True, "seed": 0, "resolution": 500,
-               "mcts_iterations": 15, "mcts_nodes": 8, "mcts_max_depth": 2}  # fmt: skip
     parts = coacd.run_coacd(coacd.Mesh(vertices, faces), **options)
     return [_at_most_64(np.asarray(points, dtype=float)) for points, _ in parts if len(points) > 3]
+
+
+def _limited(vertices: Array, faces: NDArray[np.int32], options: dict[str, Any], seconds: int) -> list[Array]:
+    """Return the points of each part; raises Slow where that is not done in time, or broke."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "mesh.npz")
+        np.savez(path, vertices=vertices, faces=faces)
+        command = [sys.executable, "-c", CHILD, path, str(seconds), repr(options)]
+        if subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL).returncode:
+            raise Slow
+        with np.load(path) as stored:
+            return np.split(stored["points"], stored["cuts"])
 
 
 def _simplified(mesh: trimesh.Trimesh) -> tuple[Array, NDArray[np.int32]]:

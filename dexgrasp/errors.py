@@ -21,6 +21,10 @@ class DexgraspError(Exception):
         return type(self), (self.expected, self.found, self.remedy)  # or it could not come back from a worker
 
 
+class UnsupportedHand(DexgraspError):
+    """A representation that cannot tell the grasps of a hand, whatever its options."""
+
+
 @contextmanager
 def room(what: str, folder: Path) -> Iterator[None]:
     """Tell a full disk, or a quota that is used up, as bad input; other errors go through."""

@@ -17,7 +17,7 @@ from dexgrasp.dataset.truth import deviation
 from dexgrasp.grasps import Grasps
 from dexgrasp.representation import Representation
 
-SCHEMA = 1
+SCHEMA = 2
 PERCENTILES = (25, 50, 75, 95)
 
 
@@ -51,6 +51,10 @@ class Fidelity:
     """One row of the table."""
 
     representation: str
+    numbers: int
+    """How many numbers tell a grasp."""
+    parameters: int
+    """Weights of its heads."""
     normals: str
     """`true`: closing's contact and the surface's normal there; `estimated`: visible points and their normals."""
     told_from: str
@@ -94,12 +98,17 @@ def best(found: Errors) -> Errors:
     return chosen.replace(truthful=torch.isin(chosen.grasp, found.grasp[found.truthful]))
 
 
-def rows(name: str, normals: str, found: Errors, *, checked: bool) -> Iterator[Fidelity]:
+def rows(
+    name: str, representation: Representation, normals: str, found: Errors, *, checked: bool
+) -> Iterator[Fidelity]:
     """Yield the table's two rows of one representation and kind of normals."""
+    parameters = sum(each.numel() for each in representation.parameters())
     for told_from, chosen in (("any", found), ("best", best(found))):
         can = chosen.encodable
         yield Fidelity(
             representation=name,
+            numbers=representation.size,
+            parameters=parameters,
             normals=normals,
             told_from=told_from,
             count=len(chosen),
@@ -111,7 +120,7 @@ def rows(name: str, normals: str, found: Errors, *, checked: bool) -> Iterator[F
 
 
 def write(table: Sequence[Fidelity], folder: Path, notes: dict[str, object]) -> None:
-    """Write results.json (schema 1: `notes` and `rows`), fidelity.md and fidelity.csv."""
+    """Write results.json (schema 2: `notes` and `rows`), fidelity.md and fidelity.csv."""
     content = {"schema": SCHEMA, "kind": "fidelity", **notes, "rows": [asdict(row) for row in table]}
     (folder / "results.json").write_text(json.dumps(content, indent=1) + "\n")
     with (folder / "fidelity.csv").open("w", newline="") as file:
@@ -122,21 +131,23 @@ def write(table: Sequence[Fidelity], folder: Path, notes: dict[str, object]) -> 
 
 
 HEADER = [
-    *("representation", "normals", "told from", "count", "encodable %", "truthful %"),
+    *("representation", "numbers", "head parameters", "normals", "told from", "count", "encodable %", "truthful %"),
     *(f"mm p{p}" for p in PERCENTILES),
     *(f"deg p{p}" for p in PERCENTILES),
 ]
 LEGEND = (
     "Displacement and rotation of the hand's base over the grasps that can be told. Told from any: every finger that "
     "touches (estimated normals: and every visible point near its contact); best: per grasp, the one that moves the "
-    "base least. Truthful: fingers closed again, the decoded grasp passes the checks of synthesis (best: from any)."
+    "base least. Head parameters: for point features of size 128. "
+    "Truthful: fingers closed again, the decoded grasp passes the checks of synthesis (best: from any)."
 )
 
 
 def cells(row: Fidelity) -> list[str]:
     """Return a row's cells as text, in the order of `HEADER`."""
     truthful = "" if row.truthful is None else f"{100 * row.truthful:.1f}"
-    lead = [row.representation, row.normals, row.told_from, str(row.count), f"{100 * row.encodable:.1f}", truthful]
+    lead = [row.representation, str(row.numbers), str(row.parameters), row.normals, row.told_from, str(row.count)]
+    lead += [f"{100 * row.encodable:.1f}", truthful]
     values = (*row.distance_mm.values(), *row.angle_deg.values())
     return lead + ["-" if value is None else f"{value:.2f}" for value in values]
 

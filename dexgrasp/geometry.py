@@ -1,8 +1,11 @@
 """Rigid motions and frames. `a_T_b` maps b-coordinates into a; everything batches over leading axes."""
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional as F
 
 
 def pose(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
@@ -36,6 +39,33 @@ def axis_angle(axis: Float[Tensor, "*b 3"], angle: Float[Tensor, "*b"]) -> Float
     sine, cosine = torch.sin(angle)[..., None, None], torch.cos(angle)[..., None, None]
     eye = torch.eye(3, dtype=axis.dtype, device=axis.device)
     return eye + sine * cross + (1 - cosine) * (cross @ cross)
+
+
+def orthonormal(columns: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 3 3"]:
+    """Return right-handed rotations whose first two columns these are, by Gram-Schmidt.
+
+    Parallel or zero columns fall back on the axes (Zhou et al. 2019, "On the continuity of rotation representations").
+    """
+    first, second = columns.split(3, dim=-1)
+    eye = torch.eye(3).to(columns)
+    x = F.normalize(torch.where(first.norm(dim=-1, keepdim=True) < 1e-6, eye[0], first), dim=-1)
+    y = second - (second * x).sum(-1, keepdim=True) * x
+    # The axis least along x is never parallel to it.
+    spare = eye[x.abs().argmin(-1)]
+    spare = spare - (spare * x).sum(-1, keepdim=True) * x
+    y = F.normalize(torch.where(y.norm(dim=-1, keepdim=True) < 1e-6, spare, y), dim=-1)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
+
+
+def golden_spiral(count: int, lowest: float = 0.0) -> Float[Tensor, "A 3"]:
+    """Return unit vectors, float64, spread evenly over the part of the sphere with z > `lowest`; a single one is +z."""
+    if count == 1:
+        return torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    number = torch.arange(count, dtype=torch.float64)
+    z = 1 - (1 - lowest) * (number + 0.5) / count
+    turn = math.pi * (3 - 5**0.5) * number
+    radius = (1 - z * z).sqrt()
+    return torch.stack([radius * turn.cos(), radius * turn.sin(), z], dim=-1)
 
 
 def rotation_angle(a: Float[Tensor, "*#b 3 3"], b: Float[Tensor, "*#b 3 3"]) -> Float[Tensor, "*b"]:

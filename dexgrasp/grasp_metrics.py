@@ -38,7 +38,8 @@ BINS, CELL = 100, 0.02
 def closed(hand: Hand, field: DistanceField, grasps: Grasps) -> Grasps:
     """Return grasps (object frame) with the contacts at which their fingers end, opened a little and closed again."""
     grasps = grasps.to(torch.float64)
-    start, touching = opened(hand, grasps.joints, OPENING, grasps.touching), grasps.touching
+    touching = grasps.touching
+    start = opened(hand, grasps.joints, OPENING, touching)
     closure = Closer(hand).close(field, grasps.pose, start, centred=True, touching=touching)
     return grasps.replace(contacts=closure.contacts, normals=closure.normals)
 

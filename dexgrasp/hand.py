@@ -3,11 +3,16 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import torch
 import trimesh
 from jaxtyping import Float
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from dexgrasp.synergies import Synergy
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +73,8 @@ class Hand(ABC):
     """Mesh of each link that has one, link coordinates."""
     collisions: Mapping[str, tuple[trimesh.Trimesh, ...]]
     """Convex parts of each link that has some, link coordinates."""
+    synergies: "Mapping[str, Synergy]" = MappingProxyType({})
+    """By name: what postures are drawn from in synthesis; empty: every joint by itself."""
 
     @abstractmethod
     def link_poses(self, joints: Float[Tensor, "N J"]) -> dict[str, Float[Tensor, "N 4 4"]]:

@@ -23,6 +23,50 @@ def _surface(body: manifold3d.Manifold) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.asarray(surface.vert_properties)[:, :3], faces, process=False)
 
 
+def lightened(mesh: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
+    """Return a copy of at most some `most` faces: edges are collapsed; where that ends early (many small bodies, loose
+    triangles), corners are gathered in ever larger cells."""
+    import fast_simplification
+
+    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    cell = float(mesh.extents.max()) / 256
+    while len(mesh.faces) > most:
+        points, faces = fast_simplification.simplify(
+            np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.int32), target_count=most
+        )
+        mesh = trimesh.Trimesh(points.astype(float), faces)
+        if len(mesh.faces) <= 1.2 * most:
+            break
+        _, first, place = np.unique(np.round(mesh.vertices / cell), axis=0, return_index=True, return_inverse=True)
+        mesh = trimesh.Trimesh(mesh.vertices[first], place.ravel()[mesh.faces])
+        mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+        mesh.remove_unreferenced_vertices()
+        cell *= 1.6
+    return mesh
+
+
+def halved(mesh: trimesh.Trimesh, count: int) -> list[trimesh.Trimesh]:
+    """Return the hulls of pieces of a surface whose longest piece is cut in two, again and again, into `count`.
+
+    Works on any surface, closed or not; each hull covers its piece, and fills its dents.
+    """
+    pieces = [mesh]
+    for _ in range(count - 1):
+        longest = max(range(len(pieces)), key=lambda i: float(pieces[i].extents.max()))
+        piece = pieces.pop(longest)
+        axis, middle = np.eye(3)[int(np.argmax(piece.extents))], piece.bounds.mean(axis=0)
+        cuts = [trimesh.intersections.slice_mesh_plane(piece, side * axis, middle) for side in (1, -1)]
+        pieces += [cut for cut in cuts if len(cut.faces)] or [piece]
+    hulls = []
+    for piece in pieces:
+        try:
+            hulls.append(piece.convex_hull)
+        except Exception:  # flat: covered by the hulls beside it, nearly
+            continue
+    return hulls
+
+
 def repaired(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, float]:
     """Return a closed version of an open mesh and how far its surface moved (m, 95th percentile, both ways).
 

@@ -1,6 +1,7 @@
 """The Representation interface: how a network tells a grasp."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from jaxtyping import Bool, Float, Int
@@ -42,6 +43,21 @@ class Representation(nn.Module, ABC):
     """How many answers the heads can give at a point, likeliest first."""
     resolution: tuple[float, float] = (1e-5, 1e-4)
     """How far decode(encode) may move a grasp that can be told: m, rad."""
+
+    def tip_contacts(self, finger: Int[Tensor, "N"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Return where fingertips 0..F-1 are taken to touch a surface that lies in unit `directions` from them.
+
+        Both in the tip frame (`Hand.fingertips`), the point in m; here the fingertip circle's ball. The laws try grasps
+        that touch so.
+        """
+        radii = directions.new_tensor([each.tip_radius for each in self.hand.fingers])
+        return radii[finger].unsqueeze(-1) * directions
+
+    def prepare(self, grasps: Iterable[Grasps]) -> None:
+        """Learn, before a training begins, what is learnt from grasps alone; here nothing.
+
+        `grasps` are those of each of the dataset's objects, in its frame. What is learnt must be in the state dict.
+        """
 
     @abstractmethod
     def encode(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grasps: Grasps) -> Targets:

@@ -15,6 +15,7 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.fingertip import fit_fingertip
 from dexgrasp.hand import Finger, Hand
 from dexgrasp.kinematics import KinematicTree, LinkRecord
+from dexgrasp.synergies import Synergy
 from dexgrasp.urdf_file import UrdfFile
 from dexgrasp.urdf_geometry import convex_pieces, joined, link_meshes
 
@@ -49,6 +50,7 @@ class UrdfHand(Hand):
         collision: `given` (the URDF's `<collision>`) or `visual`; default: `given`, where the URDF has none at all
             `visual`. What is not convex is cut into convex parts (see `convex_pieces`).
         model: nothing but a key that the YAML's `urdf` may be composed from, where a hand comes in several models.
+        synergies: {name: synergy}, postures that synthesis draws from, see `dexgrasp.synergies.Synergy.read`.
 
     Raises:
         DexgraspError: a file, link, joint or number that is missing or wrong.
@@ -70,6 +72,7 @@ class UrdfHand(Hand):
         allowed_contacts: Sequence[Sequence[str]] = (),
         collision: str | None = None,
         model: str | None = None,
+        synergies: Mapping[str, Any] | None = None,
     ) -> None:
         self.name, self.urdf = name, Path(urdf)
         self.couplings = dict(couplings or {})
@@ -105,6 +108,7 @@ class UrdfHand(Hand):
                 f"least_fingers of 2 to {len(self.fingers)}", repr(least_fingers), f"mend it in the YAML of {name!r}"
             )
         self.least_fingers = least_fingers
+        self.synergies = {name: Synergy.read(name, given, self) for name, given in (synergies or {}).items()}
 
     def link_poses(self, joints: Float[Tensor, "N J"]) -> dict[str, Float[Tensor, "N 4 4"]]:
         """Return base_T_link of every link; differentiable, dtype and device of `joints`."""

@@ -2,8 +2,10 @@
 
 import logging
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
@@ -39,10 +41,13 @@ def link_meshes(robot: ElementTree.Element, tag: str, urdf: Path) -> dict[str, l
     return meshes
 
 
-def convex_pieces(mesh: trimesh.Trimesh, link: str) -> tuple[trimesh.Trimesh, ...]:
+def convex_pieces(
+    mesh: trimesh.Trimesh, link: str, depth: float = DEPTH, seconds: int | None = None
+) -> tuple[trimesh.Trimesh, ...]:
     """Return a collision mesh as convex parts: itself, its hull where that is as good, else a decomposition (cached).
 
-    A hull is as good where it stands nowhere more than `DENT` off the mesh.
+    A hull is as good where it stands nowhere more than `DENT` off the mesh. `depth` and `seconds` are `convex_parts`'
+    threshold and time.
     """
     if mesh.is_convex:
         return (mesh,)
@@ -53,7 +58,7 @@ def convex_pieces(mesh: trimesh.Trimesh, link: str) -> tuple[trimesh.Trimesh, ..
         return (hull,)
     mesh = mesh.copy()
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    parts = convex_parts(mesh, DEPTH)
+    parts = convex_parts(mesh, depth, seconds)
     logger.info("link %s: its hull would stand %.1f mm off the mesh; %d convex parts", link, 1e3 * dent, len(parts))
     return parts
 
@@ -111,10 +116,9 @@ def _mesh(shape: ElementTree.Element, urdf: Path, link: str) -> trimesh.Trimesh:
             "copy it there, or correct the file name in the URDF (relative names count from the URDF's folder)",
         )
     try:
-        mesh = trimesh.load_mesh(path)
+        mesh = load_file(path)
     except Exception as error:
         raise DexgraspError(f"a readable mesh for link {link!r}", f"{path}: {error}", "export it again") from error
-    mesh = mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise DexgraspError(f"a mesh with faces for link {link!r}", f"none in {path}", "export it again")
     mesh.apply_scale(numbers(shape, "scale", "1 1 1"))
@@ -127,12 +131,29 @@ def _mesh(shape: ElementTree.Element, urdf: Path, link: str) -> trimesh.Trimesh:
     return mesh
 
 
+def load_file(path: Path) -> trimesh.Geometry:
+    """Return what a mesh file holds as one mesh; COLLADA's unit counts, as robots' viewers have it."""
+    mesh = trimesh.load_mesh(path)
+    mesh = mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh
+    if path.suffix.lower() == ".dae":
+        with path.open("rb") as file:
+            unit = re.search(rb'<unit\b[^>]*\bmeter\s*=\s*"([^"]+)"', file.read(1 << 16))
+        if unit and float(unit[1]) != 1.0:
+            mesh.apply_scale(float(unit[1]))
+    return mesh
+
+
 def find_mesh(name: str, urdf: Path) -> Path | None:
     """Return the file of a mesh name: relative, absolute, file:// or package://; None if there is none.
 
     `package://name/rest` is looked up as `name/rest` and as `rest` in every folder above the URDF and in those
-    of ROS_PACKAGE_PATH.
+    of ROS_PACKAGE_PATH; `%20` and the like as what they stand for, where there is no such file.
     """
+    plain = unquote(name)
+    return _find(name, urdf) or (_find(plain, urdf) if plain != name else None)
+
+
+def _find(name: str, urdf: Path) -> Path | None:
     if name.startswith("package://"):
         rest = name.removeprefix("package://")
         inside = rest.partition("/")[2]

@@ -15,9 +15,11 @@ from dexgrasp.testing import shapes
 
 # Shapes in signatures are true: checked in the modules of data and geometry, not in compiled ones (numba pickles them).
 CHECKED = "batch backbone contact_frame evaluation execution fidelity geometry grasps hand kinematics representation"
-CHECKED += " scene selection urdf"
+CHECKED += " scene selection staged_contact urdf"
 install_import_hook(
-    [f"dexgrasp.{module}" for module in CHECKED.split()] + ["dexgrasp_contact", "dexgrasp_pose", "dexgrasp_pointnet"],
+    [f"dexgrasp.{module}" for module in CHECKED.split()]
+    + ["dexgrasp_contact", "dexgrasp_contact_roll", "dexgrasp_contact_width", "dexgrasp_grasp_type", "dexgrasp_pose"]
+    + ["dexgrasp_pointnet"],
     f"{shapes.__name__}.check",
 )
 

@@ -98,8 +98,9 @@ def test_percentiles_of_a_known_deviation(toy_hand):
 
     grasps = touching_grasps(toy_hand, 67)
     pairs = fidelity.at_contacts(grasps)
-    found = fidelity.errors(Crooked(toy_hand, 16), grasps, pairs, check=lambda told, _: (told.pose[:, 0, 3] > 0, None))
-    every, chosen = fidelity.rows("crooked", "true", found, checked=True)
+    model = Crooked(toy_hand, 16)
+    found = fidelity.errors(model, grasps, pairs, check=lambda told, _: (told.pose[:, 0, 3] > 0, None))
+    every, chosen = fidelity.rows("crooked", model, "true", found, checked=True)
     assert (every.count, chosen.count) == (201, 67)
     assert every.distance_mm["p50"] == pytest.approx(20) and every.distance_mm["p75"] == pytest.approx(30)
     assert every.angle_deg["p25"] == pytest.approx(math.degrees(0.1))
@@ -112,15 +113,15 @@ def test_files_agree(contact, toy_hand, tmp_path):
     table = []
     for name, model in (("contact", contact), ("pose", Pose(toy_hand, 16))):
         found = fidelity.errors(model, grasps, fidelity.at_contacts(grasps))
-        table += fidelity.rows(name, "true", found, checked=False)
+        table += fidelity.rows(name, model, "true", found, checked=False)
     fidelity.write(table, tmp_path, {"hand": "toy", "grasps": 90})
     results = json.loads((tmp_path / "results.json").read_text())
-    assert results["schema"] == 1 and results["hand"] == "toy"
+    assert results["schema"] == 2 and results["hand"] == "toy"
     assert [row["representation"] for row in results["rows"]] == ["contact", "contact", "pose", "pose"]
     with (tmp_path / "fidelity.csv").open() as file:
         lines = list(csv.reader(file))
     assert lines[0] == fidelity.HEADER and len(lines) == 5
-    assert float(lines[1][6]) == pytest.approx(results["rows"][0]["distance_mm"]["p25"], abs=0.01)
+    assert float(lines[1][8]) == pytest.approx(results["rows"][0]["distance_mm"]["p25"], abs=0.01)
     text = (tmp_path / "fidelity.md").read_text()
     assert all(" | ".join(line) in text for line in lines)
 
@@ -128,7 +129,7 @@ def test_files_agree(contact, toy_hand, tmp_path):
 def test_nothing_to_tell_is_a_row_too(contact, toy_hand):
     grasps = touching_grasps(toy_hand)[:0]
     found = fidelity.errors(contact, grasps, fidelity.at_contacts(grasps))
-    every, chosen = fidelity.rows("contact", "true", found, checked=True)
+    every, chosen = fidelity.rows("contact", contact, "true", found, checked=True)
     assert every.count == chosen.count == 0 and every.encodable == 0
     assert every.distance_mm["p50"] is None and fidelity.cells(every)[-1] == "-"
 
@@ -150,7 +151,10 @@ def test_the_command_measures_every_representation(tmp_path):
     assert run.stdout.splitlines()[-1] == f"{tmp_path}/run"
     results = json.loads((tmp_path / "run" / "results.json").read_text())
     told = {(row["representation"], row["normals"], row["told_from"]): row for row in results["rows"]}
-    assert {key[0] for key in told} >= {"contact", "pose"} and len(told) >= 8
+    assert {key[0] for key in told} >= {"contact", "contact_roll", "grasp_type", "pose"}
+    assert "contact_width is left out: barrett" in run.stdout and "contact_width" not in {key[0] for key in told}
+    roll = told["contact_roll", "true", "any"]
+    assert roll["distance_mm"]["p95"] < 8 and roll["angle_deg"]["p95"] < 1e-3 and roll["encodable"] == 1
     pose, contact = told["pose", "true", "any"], told["contact", "true", "any"]
     assert pose["count"] == contact["count"] > 0
     assert pose["truthful"] == 1 and pose["distance_mm"]["p95"] < 1e-6 < contact["distance_mm"]["p95"]

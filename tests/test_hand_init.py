@@ -89,6 +89,13 @@ def approach(hand) -> np.ndarray:
     return hand.base_T_palm[:3, 2].numpy()
 
 
+def test_the_jaws_lf_and_rf_are_no_little_and_ring_finger(tmp_path):
+    text = write(tmp_path, PALM, *jaws()).read_text().replace("left_jaw", "lf").replace("right_jaw", "rf")
+    path = tmp_path / "gripper.urdf"
+    path.write_text(text)
+    assert made(path, tmp_path)[0].fingers == ("lf", "rf")
+
+
 def test_a_parallel_jaw(tmp_path):
     written, hand = made(write(tmp_path, PALM, *jaws()), tmp_path)
     assert hand.joint_names == ("palm_left",)
@@ -190,6 +197,18 @@ def test_a_fixed_fingertip_is_the_distal_link_and_a_pulley_is_no_finger(tmp_path
     assert any("motor is no finger" in guess.text for guess in written.guesses.made)
 
 
+def test_joints_that_move_no_finger_are_fixed_and_inertias_of_other_bodies_mended(tmp_path):
+    limit = '<limit lower="0.5" upper="9" effort="1" velocity="1"/>'
+    wheels = [link("wheel", at="0 0 0"), joint("wheel", "palm", "wheel", "0 0 -0.05", limit=limit)]
+    wheels += [link("cog", at="0 0 0"), joint("cog", "palm", "cog", "0.02 0 -0.05", extra='<mimic joint="wheel"/>')]
+    path = write(tmp_path, PALM, *claw(), *wheels)
+    path.write_text(path.read_text().replace(INERTIAL, INERTIAL.replace('"2e-5"', '"2e-2"'), 2))
+    written, hand = made(path, tmp_path)
+    assert hand.joint_names == ("near_0", "near_1", "near_2") and "wheel" in hand.link_names
+    assert any("moves no finger" in guess.text for guess in written.guesses.about("joints"))
+    assert any("which no body has" in guess.text for guess in written.guesses.about("inertias"))
+
+
 def test_couplings_are_mended_where_that_is_plain(tmp_path):
     """A name without its prefix; a chain of couplings; a follower whose own limits end the motion."""
     text = write(tmp_path, PALM, *claw()).read_text()
@@ -255,6 +274,98 @@ def test_an_mjcf_file(tmp_path):
     path.write_text("<mujoco><worldbody><body><geom/></body></worldbody></mujoco>")
     with pytest.raises(DexgraspError, match="MuJoCo compiles"):
         init_hand(path, out=tmp_path / "again")
+
+
+def bar(side, way):
+    """One side of a gripper whose pad two bars carry, closed to a loop."""
+    return f"""<body name="{side}_driver" pos="{way * 0.03} 0 .055">
+      <joint name="{side}_driver" axis="0 {-way} 0" range="0 45"/><geom type="box" size=".006 .008 .016"/>
+      <body name="{side}_coupler" pos="{way * 0.031} 0 .004"><joint name="{side}_coupler" axis="0 {-way} 0"/>
+        <geom type="box" size=".004 .008 .02" pos="0 0 .02"/></body></body>
+    <body name="{side}_spring" pos="{way * 0.0127} 0 .062"><joint name="{side}_spring" axis="0 {-way} 0"/>
+      <geom type="box" size=".005 .008 .02" pos="{way * 0.015} 0 .02"/>
+      <body name="{side}_follower" pos="{way * 0.0295} 0 .0385"><joint axis="0 {-way} 0" range="-50 50"/>
+        <geom type="box" size=".004 .011 .019" pos="{-way * 0.01} 0 .029"/></body></body>"""
+
+
+def test_closed_loops_and_a_tendon_of_an_mjcf_file(tmp_path):
+    """Joints of a loop that nothing drives follow the motor's; its force is that of the tendon on both sides."""
+    path = tmp_path / "loop.xml"
+    loops = "".join(
+        f'<connect body1="{side}_follower" body2="{side}_coupler" anchor="{way * 0.0188} 0 .0012"/>'
+        for side, way in (("left", 1), ("right", -1))
+    )
+    motor = '<motor tendon="split" forcerange="-5 5"/>'
+    text = f"""<mujoco><worldbody><body name="base"><geom type="cylinder" size=".035 .03" pos="0 0 .03"/>
+      {bar("left", 1)}{bar("right", -1)}</body></worldbody>
+      <equality>{loops}<joint joint1="right_driver" joint2="left_driver"/></equality>
+      <tendon><fixed name="split"><joint joint="right_driver" coef=".5"/><joint joint="left_driver" coef=".5"/></fixed>
+      </tendon><actuator>{motor}</actuator></mujoco>"""
+    path.write_text(text)
+    _, hand = made(path, tmp_path)
+    assert hand.joint_names == ("left_driver",)
+    assert [finger.link for finger in hand.fingers] == ["left_follower", "right_follower"]
+    assert hand.efforts[0] == pytest.approx(5.0)
+    posed = hand.link_poses(torch.tensor([[0.4]], dtype=torch.float64))
+    for side, way in (("left", 1), ("right", -1)):  # the pin of the loop holds together
+        follower, coupler = posed[f"{side}_follower"][0].numpy(), posed[f"{side}_coupler"][0].numpy()
+        start = hand.link_poses(torch.zeros(1, 1, dtype=torch.float64))
+        anchor = np.array([way * 0.0188, 0, 0.0012, 1])
+        inside = np.linalg.inv(start[f"{side}_coupler"][0].numpy()) @ start[f"{side}_follower"][0].numpy() @ anchor
+        assert np.linalg.norm((follower @ anchor - coupler @ inside)[:3]) < 2e-3
+    path.write_text(path.read_text().replace(motor, ""))
+    with pytest.raises(DexgraspError, match="that an actuator moves"):
+        init_hand(path, out=tmp_path / "again")
+
+
+@pytest.mark.parametrize("form", ["obj", "dae", "ply"])
+def test_meshes_of_all_forms_mirrored_and_with_escaped_names(tmp_path, form):
+    pads = tmp_path / "my pads"
+    pads.mkdir()
+    trimesh.creation.capsule(radius=10, height=20).export(pads / f"tip.{form}")
+    scale = 'scale="-0.001 0.001 0.001"'
+    if form == "dae":  # its own unit counts: centimetres, of which the scale makes metres
+        collada = (pads / "tip.dae").read_text()
+        (pads / "tip.dae").write_text(collada.replace("<up_axis>", '<unit name="cm" meter="0.01"/><up_axis>'))
+        scale = 'scale="-0.1 0.1 0.1"'
+    text = write(tmp_path, PALM, *claw()).read_text()
+    text = text.replace('<sphere radius="0.01"/>', f'<mesh filename="file://{tmp_path}/my%20pads/tip.{form}" {scale}/>')
+    path = tmp_path / "hand.urdf"
+    path.write_text(text)
+    _, hand = made(path, tmp_path)
+    assert all(finger.tip_radius == pytest.approx(0.01, abs=3e-4) for finger in hand.fingers)
+    assert all(part.volume > 0 for parts in hand.collisions.values() for part in parts)
+
+
+def test_a_mesh_that_takes_too_long_to_cut_is_sliced(tmp_path, monkeypatch):
+    from dexgrasp.hand_init import collision
+
+    monkeypatch.setattr(collision, "SECONDS", 0)
+    monkeypatch.setenv("DEXGRASP_CACHE", str(tmp_path / "cache"))
+    bend = trimesh.util.concatenate([trimesh.creation.torus(0.05, 0.012), trimesh.creation.icosphere(2, 0.01)])
+    bend.export(tmp_path / "palm.stl")
+    text = write(tmp_path, PALM, *jaws()).read_text()
+    path = tmp_path / "hand.urdf"
+    path.write_text(text.replace('<box size="0.12 0.12 0.04"/>', '<mesh filename="palm.stl"/>'))
+    written, hand = made(path, tmp_path)
+    assert len(hand.collisions["palm"]) == collision.PIECES
+    told = " ".join(guess.text for guess in written.guesses.unsure)
+    assert "palm could not be cut into convex parts within 0 s" in told
+
+
+def test_heavy_meshes_of_many_bodies_become_light():
+    from dexgrasp.repair import lightened
+
+    rng = np.random.default_rng(0)
+    bolts = [trimesh.creation.icosphere(2, 0.002).apply_translation(rng.uniform(-0.05, 0.05, 3)) for _ in range(60)]
+    heavy = trimesh.util.concatenate(bolts)
+    loose = trimesh.Trimesh(
+        heavy.triangles.reshape(-1, 3), np.arange(3 * len(heavy.faces)).reshape(-1, 3), process=False
+    )
+    loose.vertices = loose.vertices + rng.normal(0, 1e-5, loose.vertices.shape)
+    for mesh in (heavy, loose):
+        light = lightened(mesh, 1000)
+        assert len(light.faces) <= 1200 and np.allclose(light.bounds, mesh.bounds, atol=3e-3)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from dexgrasp import fidelity, plugins
 from dexgrasp.dataset.labels import LabelSettings, near_pairs
 from dexgrasp.dataset.truth import Truth, TruthSettings
+from dexgrasp.errors import UnsupportedHand
 from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
 from dexgrasp.progress import track
@@ -17,6 +18,7 @@ from dexgrasp.seeds import stream
 
 if TYPE_CHECKING:
     from dexgrasp.dataset.dataset import Dataset
+    from dexgrasp.representation import Representation
 
 Draw = tuple[Grasps, fidelity.Pairs, Truth]
 """Grasps, from where they are told, and their checks."""
@@ -30,22 +32,29 @@ def main(config: DictConfig) -> None:
 
     dataset = pipeline.ensure(config.dataset, config.hand)
     names = list(config.representations or plugins.names("repr"))
-    models = {name: plugins.load_representation(name, dataset.hand) for name in names}
+    models: dict[str, Representation] = {}
+    for name in names:
+        try:
+            models[name] = plugins.load_representation(name, dataset.hand)
+        except UnsupportedHand as error:
+            if config.representations:
+                raise
+            print(f"{name} is left out: {error.found}")
     table: list[fidelity.Fidelity] = []
     kinds: dict[str, Callable[[], Iterator[Draw]]] = {
         "true": lambda: _objects(dataset, config),
         "estimated": lambda: _views(dataset, config),
     }
     for normals, draws in kinds.items():
-        found: dict[str, list[fidelity.Errors]] = {name: [] for name in names}
+        found: dict[str, list[fidelity.Errors]] = {name: [] for name in models}
         first = 0
         for grasps, pairs, truth in draws():
             for name, model in models.items():
                 errors = fidelity.errors(model, grasps, pairs, truth.holds if config.truth else None)
                 found[name].append(errors.replace(grasp=errors.grasp + first))
             first += len(grasps)
-        for name in names:
-            table += fidelity.rows(name, normals, fidelity.Errors.cat(found[name]), checked=config.truth)
+        for name, model in models.items():
+            table += fidelity.rows(name, model, normals, fidelity.Errors.cat(found[name]), checked=config.truth)
     run = Path(HydraConfig.get().runtime.output_dir)
     notes = {"hand": dataset.hand.name, "dataset": str(config.dataset.name), "seed": config.seed}
     fidelity.write(table, run, notes)
@@ -87,11 +96,11 @@ def _print(table: list[fidelity.Fidelity]) -> None:
 
     shown = Table(box=None, header_style="bold", pad_edge=False)
     for number, title in enumerate(fidelity.HEADER):
-        shown.add_column(title, justify="left" if number < 3 else "right")
+        shown.add_column(title, justify="left" if number in (0, 3, 4) else "right")
     for row in table:
         shown.add_row(*fidelity.cells(row))
     console = Console()
     if not console.is_terminal:
-        console.width = 200
+        console.width = 220
     console.print(shown)
     console.print(fidelity.LEGEND, style="dim")

@@ -5,6 +5,7 @@ from importlib import import_module
 
 ACTIONS = {
     "init": "write a hand's plugin folder from a URDF or MJCF file",
+    "synergies": "compute eigengrasps from a hand's own grasps, and write a hand that draws from them",
     "check": "look a hand over: what is wrong, why it matters, how to mend it",
 }
 """Each is a module `dexgrasp.commands.hand_<action>` with `add_arguments(parser)` and `run(chosen)`."""

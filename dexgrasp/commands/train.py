@@ -20,6 +20,7 @@ from dexgrasp.dataset.pipeline import ensure, summary, table
 from dexgrasp.dataset.samples import Samples, collect
 from dexgrasp.dataset.store import digest
 from dexgrasp.errors import DexgraspError
+from dexgrasp.hand_table import grasp_yield, write_hand_table
 from dexgrasp.level import levelled
 from dexgrasp.model import GraspNet, build_model, save_model
 from dexgrasp.report import write_results
@@ -63,6 +64,8 @@ def _run(config: DictConfig, folder: Path, began: float) -> None:
     dataset = ensure(config.dataset, config.hand, config.repr)
     print(table(summary(dataset)))
     model = tuned or build_model(config, dataset.config["views"]["framing"]["points"], dataset.hand)
+    if tuned is None:  # else what was learnt then goes on
+        model.representation.prepare(dataset.grasps(index) for index in range(len(dataset.objects)))
     made = time.perf_counter()
     splits = {name: samples(dataset, model, name) for name in ("train", "validation") if dataset.split(name)}
     print(f"{len(splits['train'])} views, {splits['train'].graspable:.1%} of the seed points graspable")
@@ -73,6 +76,12 @@ def _run(config: DictConfig, folder: Path, began: float) -> None:
         raise KeyboardInterrupt
     results: dict[str, Any] = {
         "title": f"{config.hand.name}, {config.repr.name}, {config.backbone.name}, seed {config.seed}",
+        "hand": {
+            "name": config.hand.name,
+            "fingers": len(dataset.hand.fingers),
+            "joints": len(dataset.hand.joint_names),
+        },
+        "grasps": grasp_yield(dataset),
         "model": {"file": FILE, "parameters": sum(p.numel() for p in model.parameters())},
         "training": dataclasses.asdict(trained),
         "seed": config.seed,
@@ -109,7 +118,7 @@ def _run(config: DictConfig, folder: Path, began: float) -> None:
 
 
 def compare(folder: Path) -> None:
-    """After a multirun: one table over its runs."""
+    """After a multirun: one table over its runs, and one of hands where they have several."""
     runs = []
     for job in sorted(folder.iterdir(), key=lambda path: (len(path.name), path.name)):
         overrides = job / ".hydra" / "overrides.yaml"
@@ -119,6 +128,9 @@ def compare(folder: Path) -> None:
         path = compare_runs(runs, folder)
         print(path.read_text().rsplit("![]", 1)[0])
         print(path)
+        hands = write_hand_table(runs, folder)
+        if hands is not None:
+            print(f"{hands.read_text()}\n{hands}")
 
 
 def samples(dataset: Dataset, model: GraspNet, split: str) -> Samples:

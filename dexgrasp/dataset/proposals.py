@@ -15,6 +15,7 @@ from dexgrasp.dataset.surface import Surface
 from dexgrasp.execution import opened
 from dexgrasp.geometry import inverse
 from dexgrasp.hand import Hand
+from dexgrasp.synergies import synergetic
 
 WANDER = 0.008
 """How far on the surface a varied draw's point moves, m (standard deviation, as below)."""
@@ -102,7 +103,7 @@ class Approach(Proposer):
         """Depth is the palm's distance from the point, up to the hand's reach."""
         unit = torch.from_numpy(_strata(rng, count, 2))
         place = torch.stack([0.005 + (self.reach - 0.005) * unit[:, 0], 2 * math.pi * unit[:, 1]], dim=1)
-        joints = opened(self.hand, _uniform(self.hand, rng, count))
+        joints = opened(self.hand, synergetic(self.hand, _uniform(self.hand, rng, count), rng))
         finger = torch.full((count,), -1)
         return Draws(_points(surface, count, rng), finger, place, joints, self._fingers(finger, rng))
 
@@ -140,6 +141,7 @@ class Contact(Proposer):
         if any(len(finger.closing) > 1 for finger in self.hand.fingers):
             part = (part + torch.from_numpy(rng.normal(scale=BEND, size=part.shape))).clamp(0, 1)
         _close_alike(self.hand, joints, part)
+        joints = synergetic(self.hand, joints, rng)
         unit = torch.from_numpy(_strata(rng, count, 2))
         angle, z = 2 * math.pi * unit[:, :1], 0.05 + 0.95 * unit[:, 1:]  # uniform z: uniform on the sphere
         xy = torch.sqrt(1 - z**2) * torch.cat([torch.cos(angle), torch.sin(angle)], dim=1)

@@ -159,8 +159,8 @@ def metrics(grasps: Grasps, model: WrenchModel) -> dict[str, Float[Tensor, "N"]]
     """Return what is known of grasps (object frame) without physics; of all of them more should be better.
 
     `epsilon` and `volume` are of the L1 hull, `epsilon_linf` of the L-infinity hull (METHOD section 5); `spread` is
-    the contacts' mean distance from their centroid, `centred` minus the centroid's from the centre of mass, both m.
-    All are of the contacts of the fingers that touch (lengths are NaN where none does); `model` has the centre of mass
+    the contacts' mean distance from their centroid, `centred` minus the centroid's from the centre of mass, both m
+    (NaN where no finger touches). All are of the contacts of the fingers that touch; `model` has the centre of mass
     as its origin.
     """
     contacts, normals = grasps.contacts.double(), grasps.normals.double()

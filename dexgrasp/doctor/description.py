@@ -1,5 +1,6 @@
 """A hand as its YAML and URDF describe it, before anything is loaded or refused."""
 
+import logging
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,8 +15,9 @@ import trimesh
 from dexgrasp import plugins
 from dexgrasp.errors import DexgraspError
 from dexgrasp.urdf_file import read_robot
-from dexgrasp.urdf_geometry import find_mesh
+from dexgrasp.urdf_geometry import find_mesh, load_file
 
+log = logging.getLogger(__name__)
 PLACES = ("*.yaml", "hand/*.yaml", "conf/hand/*.yaml", "*/conf/hand/*.yaml")
 """Where a folder may keep a hand's YAML."""
 
@@ -123,10 +125,9 @@ class Description:
 
 def _read(path: Path) -> trimesh.Trimesh | str:
     try:
-        mesh = trimesh.load_mesh(path)
+        mesh = load_file(path)
     except Exception as error:  # each format's reader has its own exceptions
         return f"unreadable ({type(error).__name__}: {error})"
-    mesh = mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         return "empty: no faces"
     return mesh if np.isfinite(mesh.vertices).all() else "broken: vertices that are no numbers"
@@ -140,7 +141,10 @@ def find_yaml(given: str) -> str:
     than one.
     """
     folder = Path(given).expanduser()
-    if given in plugins.names("hand") or not folder.is_dir():
+    if not folder.is_dir():
+        return given
+    if given in plugins.names("hand"):
+        log.warning("%s is an installed hand, and that is looked at; for the folder of this name: ./%s", given, given)
         return given
     found = next((hits for place in PLACES if (hits := [f for f in sorted(folder.glob(place)) if _tells(f)])), [])
     if len(found) != 1:

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 from dexgrasp import plugins
@@ -11,6 +12,7 @@ from dexgrasp.doctor.description import Description, find_yaml
 from dexgrasp.doctor.finding import Finding, Severity, error, warning
 from dexgrasp.errors import DexgraspError
 from dexgrasp.hand import Hand
+from dexgrasp.progress import track
 from dexgrasp.testing import violations
 
 log = logging.getLogger(__name__)
@@ -116,7 +118,8 @@ def examine(given: str, closing: bool = True) -> Examination:
     except DexgraspError as refusal:
         return Examination(str(options["name"]), None, (_refused(refusal), *entries))
     checks = [check for check in ON_HAND if closing or check is not grasping.fingertips_reach_objects]
-    return Examination(hand.name, hand, (*entries, *laws(hand), *(_tried(check, hand) for check in checks)))
+    entries += track(chain(laws(hand), (_tried(check, hand) for check in checks)), "checks of the hand")
+    return Examination(hand.name, hand, tuple(entries))
 
 
 def laws(hand: Hand) -> Iterator[Entry]:

@@ -10,6 +10,7 @@ from dexgrasp.convex import deviation
 from dexgrasp.doctor.finding import Finding, error, note, warning
 from dexgrasp.doctor.solid import bodies, closed_by, outside, way_out
 from dexgrasp.hand import Hand
+from dexgrasp.repair import lightened
 from dexgrasp.urdf_geometry import joined
 
 SMALL, LARGE = 0.04, 0.6
@@ -72,7 +73,9 @@ def collision_follows_what_is_seen(hand: Hand) -> Iterator[Finding]:
     fingers = {finger.link for finger in hand.fingers}
     poses = {link: pose[0].numpy() for link, pose in hand.link_poses(closed_by(hand, 0.0)).items()}
     for carrier, links in bodies(hand).items():
-        seen = [_light(hand.visuals[link]).apply_transform(poses[link]) for link in links if link in hand.visuals]
+        seen = [
+            lightened(hand.visuals[link], LIGHT).apply_transform(poses[link]) for link in links if link in hand.visuals
+        ]
         parts = [part.copy().apply_transform(poses[link]) for link in links for part in hand.collisions.get(link, ())]
         if not seen:
             continue
@@ -158,11 +161,6 @@ def _shapes(hand: Hand) -> Iterator[tuple[str, trimesh.Trimesh]]:
     for link, parts in hand.collisions.items():
         for part in parts:
             yield link, part
-
-
-def _light(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a copy with at most `LIGHT` faces, nearly."""
-    return mesh.copy() if len(mesh.faces) <= LIGHT else mesh.simplify_quadric_decimation(face_count=LIGHT)
 
 
 def _within(meshes: list[trimesh.Trimesh], points: np.ndarray) -> np.ndarray:

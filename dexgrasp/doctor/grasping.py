@@ -22,6 +22,7 @@ from dexgrasp.geometry import axis_angle, inverse
 from dexgrasp.geometry import pose as rigid
 from dexgrasp.hand import Hand
 from dexgrasp.objects import Object
+from dexgrasp.progress import track
 from dexgrasp.seeds import stream
 
 SIZES = (0.02, 0.04, 0.06, 0.08, 0.10)
@@ -63,7 +64,9 @@ def reaches(hand: Hand) -> list[Reach]:
     """Close a hand on balls and cubes of `SIZES`; kept with the hand. The same hand, the same result."""
     if "_reaches" not in hand.__dict__:
         shape, closer = HandShape(hand), Closer(hand)
-        hand.__dict__["_reaches"] = [_reach(hand, shape, closer, *item) for item in _objects()]
+        hand.__dict__["_reaches"] = [
+            _reach(hand, shape, closer, *item) for item in track(list(_objects()), "closing on balls and boxes")
+        ]
     known: list[Reach] = hand.__dict__["_reaches"]
     return known
 

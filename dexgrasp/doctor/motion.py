@@ -19,6 +19,8 @@ STEPS = 20
 """Postures looked at from open to closed."""
 EARLY = 0.25
 """Fingers that meet before this part of closing leave no room for an object."""
+CROSSED = 0.7
+"""Fingertips that come so much nearer on the way (part of their distance when open) pass each other."""
 FACING = 0.5
 """A pad faces what lies this much (cosine) in a direction in which it can press."""
 ARC = (0.0, 15.0, 30.0, 45.0, 60.0)
@@ -64,8 +66,8 @@ def fingers_have_room_to_close(hand: Hand) -> Iterator[Finding]:
 def fingers_close_pad_first(hand: Hand) -> Iterator[Finding]:
     """Closing carries each fingertip towards its pad, and nearer to the others."""
     middle = drawn(hand, 64)
-    opened, closed = _tips(hand, closed_by(hand, 0.0, middle)), _tips(hand, closed_by(hand, 1.0, middle))
-    before, after = _apart(opened), _apart(closed)
+    way = torch.stack([_apart(_tips(hand, closed_by(hand, k / STEPS, middle))) for k in range(STEPS + 1)])
+    before, after, least = way[0], way[-1], way.min(dim=0).values
     for i, finger in enumerate(hand.fingers):
         rates = _rates(hand, finger)
         if not rates.abs().max():
@@ -83,13 +85,16 @@ def fingers_close_pad_first(hand: Hand) -> Iterator[Finding]:
                 "the finger opens when it should close, or its pad is told to be on its back: every grasp misses",
                 "change the sign of `closing`, or of `closing_axis` if that is given, in the hand's YAML",
             )
+        passed = least[i] < CROSSED * before[i] and after[i] < before[i] / CROSSED
         if after[i] > before[i]:
-            yield error(
+            yield (warning if passed else error)(
                 finger.name,
                 f"closing ({told}) carries its tip away from the others: {before[i] * 1e3:.0f} mm from them when open, "
-                f"{after[i] * 1e3:.0f} mm when closed",
-                "open and closed are exchanged: the hand would approach with closed fingers and open them",
-                "change the sign of `closing` in the hand's YAML (1 is towards the upper limit)",
+                f"{after[i] * 1e3:.0f} mm when closed" + (f", {least[i] * 1e3:.0f} mm on the way" if passed else ""),
+                "open and closed are exchanged: the hand would approach with closed fingers and open them"
+                + ("; or the tips pass each other, and its range is wider than needed" if passed else ""),
+                "change the sign of `closing` in the hand's YAML (1 is towards the upper limit)"
+                + (", or narrow `limits`" if passed else ""),
             )
 
 

@@ -22,6 +22,8 @@ VIEW = 26.0
 FINGERS = ((0.85, 0.37, 0.34), (0.30, 0.55, 0.80), (0.40, 0.68, 0.38), (0.87, 0.65, 0.25), (0.60, 0.45, 0.75))
 """Colours of the fingers, in order."""
 GREY, DARK = (0.72, 0.72, 0.74), (0.15, 0.15, 0.15)
+FROM = np.array([0.80, -0.50, 0.33]) / np.linalg.norm([0.80, -0.50, 0.33])
+"""Where the hand is seen from, palm frame."""
 AXES = ((0.9, 0.1, 0.1), (0.1, 0.7, 0.1), (0.1, 0.2, 0.95))
 
 Body = tuple[trimesh.Trimesh, NDArray[np.float64], tuple[float, float, float]]
@@ -34,9 +36,7 @@ def portrait(hand: Hand) -> NDArray[np.uint8]:
     (short; the pad faces against y). Black balls lie where a fingertip touches pad-first.
     """
     postures = {text: closed_by(hand, part) for text, part in PARTS.items()}
-    points = [_corners(hand, joints) for joints in postures.values()]
-    low, high = np.min([p.min(axis=0) for p in points], axis=0), np.max([p.max(axis=0) for p in points], axis=0)
-    center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    center, radius = extent(hand)
     camera = _camera(hand, center, 0.80 * radius / np.sin(np.radians(VIEW / 2)))
     rows = []
     for solid in (False, True):
@@ -46,6 +46,13 @@ def portrait(hand: Hand) -> NDArray[np.uint8]:
             panels.append(picture(bodies, camera, SIZE, VIEW, floor=False))
         rows.append(np.concatenate(panels, axis=1))
     return np.concatenate(rows, axis=0)
+
+
+def extent(hand: Hand) -> tuple[NDArray[np.float64], float]:
+    """Return centre (base frame) and radius, m, of the box that holds the hand from open to closed."""
+    points = np.concatenate([_corners(hand, closed_by(hand, part)) for part in PARTS.values()])
+    low, high = points.min(axis=0), points.max(axis=0)
+    return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
 
 
 def write_portrait(hand: Hand, path: Path) -> Path:
@@ -135,7 +142,7 @@ def _corners(hand: Hand, joints: torch.Tensor) -> NDArray[np.float64]:
 def _camera(hand: Hand, center: NDArray[np.float64], distance: float) -> NDArray[np.float64]:
     """Return base_T_camera: the palm's approach points up in the picture, seen from the side, a little from above."""
     palm = hand.base_T_palm[:3, :3].numpy()
-    eye = center + palm @ (distance * np.array([0.80, -0.50, 0.33]) / np.linalg.norm([0.80, -0.50, 0.33]))
+    eye = center + palm @ (distance * FROM)
     to_palm = palm.T
     looked = look_at(torch.from_numpy(to_palm @ eye), torch.from_numpy(to_palm @ center)).numpy()
     turned = np.eye(4)

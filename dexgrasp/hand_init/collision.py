@@ -6,14 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from dexgrasp.convex import convex_parts, deviation
+from dexgrasp.convex import Slow, convex_parts, deviation
 from dexgrasp.hand_init.anatomy import Anatomy
 from dexgrasp.hand_init.fingers import FingerGuess
 from dexgrasp.hand_init.guess import Guesses
 from dexgrasp.hand_init.mesh_files import placed
 from dexgrasp.hand_init.model import Link, Model
+from dexgrasp.progress import track
+from dexgrasp.repair import halved, lightened
 from dexgrasp.shapes.solid import fibonacci
-from dexgrasp.urdf_geometry import convex_pieces, joined
+from dexgrasp.urdf_geometry import DEPTH, convex_pieces, joined
 
 FAR, FAR_TIP = 0.004, 0.002
 """Given collision shapes that are farther (95 %) from the visual ones are made anew, m; on distal links."""
@@ -23,6 +25,8 @@ MOST, COARSE = 12, 0.016
 """A link of more parts is cut less finely: slower for nothing; twice the depth of dents that may be filled, m."""
 FACES, CUT = 20000, 3000
 """A mesh of more faces is simplified before it is written, and before it is cut."""
+SECONDS, PIECES = 30, 6
+"""Processor time that cutting a mesh may take; where that is not enough, hulls of so many slices stand for it."""
 log = logging.getLogger(__name__)
 
 
@@ -51,7 +55,7 @@ def read_visuals(model: Model, guesses: Guesses) -> None:
     """Set what one sees of each link: its visual shapes, else its collision shapes."""
     for link in model.links.values():
         meshes = placed(link.visuals) or placed(link.collisions)
-        link.visual = _light(joined(meshes)) if meshes else None
+        link.visual = lightened(joined(meshes), FACES) if meshes else None
 
 
 def drop_envelopes(anatomy: Anatomy, guesses: Guesses) -> None:
@@ -82,12 +86,10 @@ def drop_envelopes(anatomy: Anatomy, guesses: Guesses) -> None:
 def make_parts(model: Model, fingers: list[FingerGuess], guesses: Guesses) -> list[Fit]:
     """Set the convex parts of every link that has a shape: the given ones where they fit what one sees."""
     tips, fits = {finger.link for finger in fingers}, []
-    made: dict[bytes, tuple[trimesh.Trimesh, ...] | None] = {}
-    for link in model.links.values():
-        if not link.solid:
-            continue
+    made: dict[bytes, tuple[tuple[trimesh.Trimesh, ...], str]] = {}
+    for link in track([link for link in model.links.values() if link.solid], "collision shapes"):
         given, seen = placed(link.collisions), placed(link.visuals)
-        whole = joined(seen or given)
+        whole = lightened(joined(seen or given), FACES)
         limit = FAR_TIP if link.name in tips else FAR
         fit = None
         if given:
@@ -95,7 +97,7 @@ def make_parts(model: Model, fingers: list[FingerGuess], guesses: Guesses) -> li
             fit = _fit(link, "given", whole)
         if seen and (fit is None or fit.worst > limit):
             old, before = link.parts, fit
-            link.parts = _parts([_light(whole)], link, guesses, made)
+            link.parts = _parts([whole], link, guesses, made)
             fit = _fit(link, "from the visual mesh", whole)
             if before is None:
                 text = f"{link.name} has no collision shape; {fit} of the visual mesh taken"
@@ -116,7 +118,7 @@ def _parts(
     meshes: list[trimesh.Trimesh],
     link: Link,
     guesses: Guesses,
-    made: dict[bytes, tuple[trimesh.Trimesh, ...] | None],
+    made: dict[bytes, tuple[tuple[trimesh.Trimesh, ...], str]],
 ) -> tuple[trimesh.Trimesh, ...]:
     """Return convex parts; the same mesh is cut once."""
     parts: list[trimesh.Trimesh] = []
@@ -124,24 +126,30 @@ def _parts(
         key = np.round(mesh.triangles, 7).tobytes()
         if key not in made:
             made[key] = _cut(mesh, link.name)
-        found = made[key]
-        if found is None:
-            found = (_wrapped(mesh),)
-            guesses.add("collision", f"{link.name} could not be cut into convex parts: its hull was taken", "UNSURE")
+        found, trouble = made[key]
+        if trouble:
+            guesses.add("collision", f"{link.name} {trouble}", "UNSURE")
         parts += found
     return tuple(parts)
 
 
-def _cut(mesh: trimesh.Trimesh, link: str) -> tuple[trimesh.Trimesh, ...] | None:
-    """Return a mesh as not too many convex parts; None where that fails."""
+def _cut(mesh: trimesh.Trimesh, link: str) -> tuple[tuple[trimesh.Trimesh, ...], str]:
+    """Return a mesh as not too many convex parts, and what was in the way."""
+    # An open mesh is closed by voxels first, whose time grows with the faces, and whose steps are no dents.
+    mesh = lightened(mesh, CUT)
+    depth = DEPTH if mesh.is_watertight else 2 * DEPTH
     try:
-        # An open mesh is closed by voxels first, whose time grows with the faces.
-        mesh = _light(mesh, CUT)
-        parts = tuple(_few_corners(part) for part in convex_pieces(mesh, link))
-        return parts if len(parts) <= MOST else convex_parts(mesh, COARSE)
+        parts = tuple(_few_corners(part) for part in convex_pieces(mesh, link, depth, SECONDS))
+        return (parts if len(parts) <= MOST else convex_parts(mesh, COARSE, SECONDS)), ""
+    except Slow:
+        reason = f"could not be cut into convex parts within {SECONDS} s"
     except Exception as error:  # the decomposition has its own on broken meshes
+        reason = "could not be cut into convex parts"
         log.debug("%s: %s", link, error)
-        return None
+    slices = tuple(_few_corners(hull) for hull in halved(mesh, PIECES))
+    if slices:
+        return slices, f"{reason}: the hulls of {len(slices)} slices of it were taken"
+    return (_wrapped(mesh),), f"{reason}: its hull was taken"
 
 
 def _few_corners(part: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -179,17 +187,3 @@ def _fit(link: Link, source: str, mesh: trimesh.Trimesh) -> Fit:
     if mesh.is_watertight:
         beyond = np.where(mesh.contains(open_), 0.0, beyond)
     return Fit(link.name, source, len(link.parts), float(np.quantile(outside, 0.95)), float(np.quantile(beyond, 0.95)))
-
-
-def _light(mesh: trimesh.Trimesh, most: int = FACES) -> trimesh.Trimesh:
-    """Return a mesh of at most `most` faces."""
-    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces)
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    if len(mesh.faces) <= most:
-        return mesh
-    import fast_simplification
-
-    points, faces = fast_simplification.simplify(
-        np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.int32), target_count=most
-    )
-    return trimesh.Trimesh(points.astype(float), faces)

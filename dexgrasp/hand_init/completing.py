@@ -4,9 +4,9 @@ import numpy as np
 import trimesh
 
 from dexgrasp.hand_init.anatomy import Anatomy
-from dexgrasp.hand_init.fingers import WIDEST, FingerGuess, group_mesh, middle, tip_positions
+from dexgrasp.hand_init.fingers import WIDEST, FingerGuess, group_mesh, middle, span, tip_positions
 from dexgrasp.hand_init.guess import Guesses
-from dexgrasp.hand_init.model import Inertia, Joint, Model
+from dexgrasp.hand_init.model import Inertia, Joint, Model, motion
 
 OPEN = 0.04
 """A jaw without limits that is closed at zero opens so far, m."""
@@ -16,6 +16,8 @@ TIP_FORCE = 15.0
 """What a finger presses with where the model does not say, N."""
 STRONGEST, STRONG = 1000.0, 60.0
 """Tip forces (N) that no hand has, and that few have."""
+SPREAD = 2.0
+"""No body's radius of gyration is so many times its length."""
 DENSITY = 1200.0
 """Of a link without a mass: plastic with some metal, kg/m3."""
 
@@ -30,6 +32,21 @@ def order_ranges(model: Model, guesses: Guesses) -> None:
             guesses.add("limits", f"{joint.name}: lower was above upper; exchanged", "UNSURE")
         if not np.isfinite(joint.upper - joint.lower) or joint.upper - joint.lower < 1e-9:
             joint.lower = joint.upper = np.nan
+
+
+def fix_idle(model: Model, fingers: list[FingerGuess], guesses: Guesses) -> None:
+    """Fix joints that move no finger, with those that follow them, where they stand at zero or the limit next to it."""
+    used = {driver for finger in fingers for driver in finger.drivers}
+    idle = [joint for joint in model.free if joint.name not in used]
+    values = {joint.name: np.array([np.clip(0.0, *span(joint))]) for joint in idle}
+    leads = {joint.name: model.driver(joint.name) for joint in model.joints.values() if joint.moves}
+    for name, lead in leads.items():
+        if lead.joint in values:
+            joint = model.joints[name]
+            joint.origin = joint.origin @ motion(joint, lead.rate * values[lead.joint] + lead.offset)[0]
+            joint.kind, joint.mimic = "fixed", None
+    if idle:
+        guesses.add("joints", f"{', '.join(joint.name for joint in idle)}: moves no finger; fixed", "likely")
 
 
 def complete_ranges(anatomy: Anatomy, fingers: list[FingerGuess], guesses: Guesses) -> None:
@@ -118,7 +135,9 @@ def complete_inertias(model: Model, guesses: Guesses) -> None:
         reason = "none"
         if found is not None and found.mass > 0 and np.isfinite(found.mass):
             moments = np.linalg.eigvalsh(found.moments)
-            if moments[0] > 0 and moments[2] <= (moments[0] + moments[1]) * 1.01:
+            real = moments[0] > 0 and moments[2] <= (moments[0] + moments[1]) * 1.01
+            length = np.inf if link.mesh is None else float(link.mesh.extents.max())
+            if real and moments[2] <= found.mass * (SPREAD * length) ** 2:
                 continue
             reason = f"principal moments {np.array2string(moments, precision=2)} kg m2, which no body has"
         elif found is not None and not link.solid:

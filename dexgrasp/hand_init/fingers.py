@@ -18,8 +18,8 @@ FINGER_WORDS = ("thumb", "index", "middle", "ring", "little", "pinky", "pinkie")
 SHORT_WORDS = {"th": "thumb", "ff": "index", "mf": "middle", "rf": "ring", "lf": "little", "if": "index"}
 WIDEST = {"revolute": 4.2, "prismatic": 0.3}
 """No finger joint moves farther, rad or m: a range beyond stands for none."""
-FOLLOWED = 0.012
-"""A link that stays this near to a longer finger's links is a part of its linkage, m."""
+FOLLOWED, LINKED = 0.012, 0.03
+"""A link that stays this near to a longer finger's links is a part of its linkage, m; in a closed loop with it."""
 
 
 @dataclass
@@ -149,20 +149,22 @@ def _without_followers(anatomy: Anatomy, fingers: list[FingerGuess], guesses: Gu
     values = {joint.name: np.linspace(*span(joint), 5) for joint in model.free}
     tips = tip_positions(model, fingers, values)
     travel = np.linalg.norm(np.diff(tips, axis=0), axis=-1).sum(axis=0)
+    bases = np.mean([f.chain.joints[0].origin[:3, 3] for f in fingers], axis=0)
+    reach = np.linalg.norm(tips - bases, axis=-1).max(axis=0)
     poses = model.poses(values)
     trees = [_points(model, finger, poses) for finger in fingers]
     kept = []
     for i, finger in enumerate(fingers):
         reason = "its tip does not move" if travel[i] < 0.004 else ""
         for j, other in enumerate(fingers):
-            longer = len(other.chain.joints) > len(finger.chain.joints) and set(finger.drivers) <= set(other.drivers)
-            if not longer or reason:
+            longer = len(other.chain.joints) > len(finger.chain.joints)
+            linked = finger.last.looped and other.last.looped and reach[j] > reach[i]
+            if not (longer or linked) or reason or not set(finger.drivers) <= set(other.drivers):
                 continue
             apart = max(float(cKDTree(trees[j][k]).query(tips[k, i])[0]) for k in range(len(tips)))
-            if travel[i] < 0.4 * travel[j] or apart < FOLLOWED:
-                reason = (
-                    f"it is moved with {other.name}, {'and keeps to its links' if apart < FOLLOWED else 'far less'}"
-                )
+            near = apart < (LINKED if linked else FOLLOWED)
+            if travel[i] < 0.4 * travel[j] or near:
+                reason = f"it is moved with {other.name}, {'and keeps to its links' if near else 'far less'}"
         if reason:
             guesses.add("fingers", f"{finger.link} is no finger: {reason}", "likely")
         else:
@@ -191,7 +193,10 @@ def _names(chains: list[Chain]) -> list[str]:
         words = [w for joint in chain.joints for w in (joint.name, joint.child)] + chain.links
         tokens = {token for word in words for token in _tokens(word)}
         hits = [word for word in FINGER_WORDS if any(word in token for token in tokens)]
-        hits = hits or [full for short, full in SHORT_WORDS.items() if short in {t.removesuffix("j") for t in tokens}]
+        if len(chains) > 2:  # the jaws lf and rf of a gripper are no little and ring finger
+            hits = hits or [
+                word for short, word in SHORT_WORDS.items() if short in {t.removesuffix("j") for t in tokens}
+            ]
         found.append(hits[0] if len(hits) == 1 else "")
     if "" not in found and len(set(found)) == len(found):
         return found

@@ -9,6 +9,7 @@ from numpy import ndarray
 from scipy.spatial import ConvexHull, QhullError
 
 from dexgrasp.ball_tree import planes
+from dexgrasp.doctor.solid import outside, way_out
 from dexgrasp.errors import DexgraspError
 from dexgrasp.fingertip import fit_fingertip
 from dexgrasp.hand_init.fingers import FingerGuess, middle
@@ -21,8 +22,12 @@ BESIDE = 0.006
 """A round tip that goes over into a flat side touches that at its end, or so far beside it, m."""
 NEAR = 0.015
 """The pad begins this near to where the fitted circle would touch, m."""
+AWAY = 0.016
+"""It is not so far from the fitted circle, m."""
 PAD = 0.008
 """Largest circle in a flat pad, and how far from its end it touches, m."""
+LOOSE = 0.002
+"""A circle that is farther off what collides is none, m."""
 REACH = 0.03
 """Distance from the tip's centre to the virtual outer joint of a slide, m (METHOD section 1)."""
 
@@ -76,7 +81,15 @@ def find_fingertip(model: Model, finger: FingerGuess, approach: np.ndarray, gues
         center, radius, told = tip - 0.008 * _unit(tip - origin), 0.008, ("tip_radius", "tip_center", *told)
         guesses.add(topic, "no circle could be fitted: 8 mm at the end of the mesh was taken; look at it", "UNSURE")
     pad = np.cross(axis, _unit(center - origin)) if distal is None else direction
-    flat = _on_pad(model.links[finger.link].parts, center, radius, axis, pad)
+    parts = model.links[finger.link].parts
+    off = _off(parts, center, radius, axis, pad)
+    flat = _on_pad(parts, center, radius, axis, pad)
+    if flat is None and off > LOOSE:
+        reach = way_out(parts, center, pad)
+        text = f"the circle of {radius * 1e3:.1f} mm is {off * 1e3:.1f} mm off what collides; look at it"
+        guesses.add(topic, text, "UNSURE")
+        if reach > LOOSE:
+            radius, told = reach, ("tip_radius", "tip_center", *told)
     if flat is not None:
         (center, radius), told = flat, ("tip_radius", "tip_center", *told)
         text = f"the pad is flat: a circle of {radius * 1e3:.1f} mm that touches it near its end"
@@ -90,6 +103,18 @@ def find_fingertip(model: Model, finger: FingerGuess, approach: np.ndarray, gues
     return Fingertip(radius, center, axis, outer, told)
 
 
+def _off(
+    parts: tuple[trimesh.Trimesh, ...], center: np.ndarray, radius: float, axis: np.ndarray, pad: np.ndarray
+) -> float:
+    """Return how far the circle is off what collides where it is nearest, from the pad's direction to the tip's, m."""
+    if not parts or outside(parts, center[None])[0] > 0:
+        return radius if parts else 0.0
+    across, end = pad, np.cross(pad, axis)
+    angles = np.radians([0.0, 15.0, 30.0, 45.0, 60.0])
+    ways = [np.cos(angle) * across + np.sin(angle) * end for angle in angles]
+    return min(abs(way_out(parts, center, way) - radius) for way in ways)
+
+
 def _on_pad(
     parts: tuple[trimesh.Trimesh, ...], center: np.ndarray, radius: float, axis: np.ndarray, pad: np.ndarray
 ) -> tuple[np.ndarray, float] | None:
@@ -98,7 +123,7 @@ def _on_pad(
     along = np.cross(across, axis)
     # The part that holds the circle's middle: a hull over several would have sides that nothing has.
     depths = [float((side[:, :3] @ center - side[:, 3]).max()) for side in map(planes, parts)]
-    parts = parts[int(np.argmin(depths)) :][:1] if depths else ()
+    every, parts = parts, parts[int(np.argmin(depths)) :][:1] if depths else ()
     cuts = [trimesh.intersections.mesh_plane(part, axis, center + 1e-7 * axis).reshape(-1, 3) for part in parts]
     points = np.vstack([np.zeros((0, 3)), *cuts]) - center
     if len(points) < 4:
@@ -132,6 +157,10 @@ def _on_pad(
         return None  # a round tip: its circle is as thick as the finger
     new = min(PAD, thick / 2)
     middle = stop + min(PAD, length[side] / 2) * way - new * normal
+    touch = center + (middle[0] + new * normal[0]) * along + (middle[1] + new * normal[1]) * across
+    buried = min(float((each[:, :3] @ touch - each[:, 3]).max()) for each in map(planes, every)) < -TOUCHING
+    if buried or np.linalg.norm(middle) > AWAY:
+        return None  # a seam between parts, or the side of a finger with a round end
     return center + middle[0] * along + middle[1] * across, new
 
 

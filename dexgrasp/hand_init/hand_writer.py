@@ -9,7 +9,13 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.hand_init.anatomy import find_hand
 from dexgrasp.hand_init.closing import find_closing
 from dexgrasp.hand_init.collision import drop_envelopes, make_parts, read_visuals
-from dexgrasp.hand_init.completing import complete_efforts, complete_inertias, complete_ranges, order_ranges
+from dexgrasp.hand_init.completing import (
+    complete_efforts,
+    complete_inertias,
+    complete_ranges,
+    fix_idle,
+    order_ranges,
+)
 from dexgrasp.hand_init.fingers import find_fingers
 from dexgrasp.hand_init.fingertip import find_fingertip
 from dexgrasp.hand_init.folder import Found, refuse, write_folder
@@ -66,6 +72,7 @@ def init_hand(
     drop_envelopes(anatomy, guesses)
     order_ranges(model, guesses)
     fingers = find_fingers(anatomy, guesses)
+    fix_idle(model, fingers, guesses)
     shared = find_closing(anatomy, fingers, guesses)
     complete_ranges(anatomy, fingers, guesses)
     palm = find_palm(anatomy, fingers, guesses)

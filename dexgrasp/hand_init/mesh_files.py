@@ -10,7 +10,7 @@ import trimesh
 from dexgrasp.errors import DexgraspError
 from dexgrasp.hand_init.guess import Guesses
 from dexgrasp.hand_init.model import Link, Shape
-from dexgrasp.urdf_geometry import find_mesh
+from dexgrasp.urdf_geometry import find_mesh, load_file
 
 LARGEST = 2.0
 """No link of a robot that has a hand is longer, m: such a mesh is in millimetres."""
@@ -95,10 +95,9 @@ def placed(shapes: list[Shape]) -> list[trimesh.Trimesh]:
 
 def _read(path: Path) -> trimesh.Trimesh | str:
     try:
-        loaded = trimesh.load_mesh(path)
+        mesh = load_file(path)
     except Exception as error:  # each format's reader has its own exceptions
         return f"{path} cannot be read: {type(error).__name__}: {error}"
-    mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         return f"{path} holds no faces"
     if not np.isfinite(mesh.vertices).all():

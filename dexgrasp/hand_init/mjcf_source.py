@@ -8,6 +8,7 @@ import trimesh
 
 from dexgrasp.errors import DexgraspError
 from dexgrasp.hand_init.guess import Guesses
+from dexgrasp.hand_init.loops import close_loops, follows
 from dexgrasp.hand_init.model import Inertia, Joint, Link, Mimic, Model, Shape, motion
 from dexgrasp.hand_init.urdf_source import capsule
 
@@ -147,7 +148,7 @@ class _Source:
 
 def _couple(m: mujoco.MjModel, joints: list[Joint], guesses: Guesses) -> None:
     """Turn equality constraints and fixed tendons of joints into couplings; what cannot be told is noted."""
-    by_number = {number: mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_JOINT, number) for number in range(m.njnt)}
+    by_number = {n: mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_JOINT, n) or f"joint_{n}" for n in range(m.njnt)}
     known = {joint.name: joint for joint in joints if joint.moves}
     for number in range(m.neq):
         kind = mujoco.mjtEq(int(m.eq_type[number]))
@@ -164,9 +165,16 @@ def _couple(m: mujoco.MjModel, joints: list[Joint], guesses: Guesses) -> None:
                 )
             offset = float(data[0] + zero[0] - data[1] * zero[1])
             _follow(known, follower, leader, float(data[1]), offset, guesses)
-        elif kind in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
-            text = "a closed loop (equality connect or weld) cannot be told in a URDF: the joints in it move freely"
-            guesses.add("couplings", f"{text}; couple those that follow by <mimic>", "UNSURE")
+        elif kind == mujoco.mjtEq.mjEQ_TENDON:
+            guesses.add("couplings", "an equality of tendons was left out: its joints move freely", "UNSURE")
+    driven = _pull(m, by_number, known, guesses)
+    close_loops(m, {name: number for number, name in by_number.items()}, known, driven, guesses)
+
+
+def _pull(m: mujoco.MjModel, by_number: dict[int, str], known: dict[str, Joint], guesses: Guesses) -> set[str]:
+    """Couple the joints that one motor's tendon pulls; return the joints that motors drive."""
+    joint = mujoco.mjtTrn.mjTRN_JOINT
+    driven = {by_number[int(m.actuator_trnid[a, 0])] for a in range(m.nu) if m.actuator_trntype[a] == joint}
     for actuator in range(m.nu):
         if m.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_TENDON:
             continue
@@ -181,6 +189,13 @@ def _couple(m: mujoco.MjModel, joints: list[Joint], guesses: Guesses) -> None:
             text = f"one tendon pulls {' and '.join(names)}: {name} follows {free[0][0]}, though it may lag behind"
             guesses.add("couplings", text, "UNSURE")
             _follow(known, name, free[0][0], rate / free[0][1], 0.0, guesses)
+        driven |= set(names)
+        if free and m.actuator_forcelimited[actuator] and not np.isfinite(known[free[0][0]].effort):
+            # Virtual work of the tendon's force on all joints that it pulls, told of the one that leads.
+            force = float(np.abs(m.actuator_forcerange[actuator] * m.actuator_gear[actuator, 0]).max())
+            work = [rate * follows(known, name)[1] for name, rate in zip(names, rates, strict=True) if name in known]
+            known[free[0][0]].effort = force * abs(sum(work))
+    return driven
 
 
 def _follow(known: dict[str, Joint], name: str, leader: str, rate: float, offset: float, guesses: Guesses) -> None:

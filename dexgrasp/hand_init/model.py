@@ -87,6 +87,8 @@ class Joint:
     effort: float = math.nan
     velocity: float = math.nan
     mimic: Mimic | None = None
+    looped: bool = False
+    """Whether a closed loop moves it."""
 
     @property
     def moves(self) -> bool:

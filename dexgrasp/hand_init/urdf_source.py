@@ -23,7 +23,7 @@ def read_urdf(path: Path, robot: ElementTree.Element, guesses: Guesses) -> Model
     Raises DexgraspError for what cannot be understood.
     """
     if any("xacro" in element.tag for element in robot.iter()):
-        remedy = f"expand it first: xacro {path.name} > {path.stem}.urdf"
+        remedy = f"expand it first: xacro {path.name} > {path.name.partition('.')[0]}.urdf"
         raise DexgraspError("a URDF", f"xacro macros in {path}", remedy)
     links = [_link(element, path) for element in robot.findall("link")]
     joints = [_joint(element, path) for element in robot.findall("joint")]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexgrasp.grasps import Reason
+from dexgrasp.simulation.closing_servos import ClosingServos
 from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.simulation.world import World
 
@@ -51,7 +52,6 @@ class Attempt:
     def __init__(self, world: World, poses: Array, plan: Plan, protocol: Protocol, target: int = -1) -> None:
         self.world, self.plan, self.protocol, self.target = world, plan, protocol, target
         self.model, self.data = world.model, world.data
-        self.limits = world.hand.limits.numpy()  # type: ignore[union-attr]
         world.reset(poses)
         world.place_hand(plan.start_pose, plan.start_joints)
         self.poses = poses
@@ -105,47 +105,42 @@ class Attempt:
         Fingers do not yield: as with a worm gear, a servo's goal never goes back, so that two fingers which push
         with the searching effort cannot drive back a third, which resists with all of its effort.
         """
-        motion, error, world = self.protocol.motion, self.protocol.physics.servo_error, self.world
-        closing = np.flatnonzero(self.plan.direction)
-        direction = self.plan.direction[closing]
-        # Joints told so that all of them close upwards.
-        end = (direction[:, None] * self.limits[closing]).max(axis=1)
+        motion, error = self.protocol.motion, self.protocol.physics.servo_error
+        servos = ClosingServos(self.world, self.plan.direction, motion.synergy_effort is not None)
+        closing, direction = servos.closing, servos.direction
         start, grasp = direction * self.plan.start_joints[closing], direction * self.plan.joints[closing]
         steps = max(self._steps(float(np.abs(grasp - start).max(initial=0.0)) / motion.closing_speed), 1)
         wanted = start + np.linspace(0, 1, steps + 1)[1:, None] * (grasp - start)
         beyond = np.inf if motion.overdrive is None else motion.overdrive
         speed, lead = motion.closing_speed * self.protocol.physics.timestep, motion.closing_effort * error
-        drivers, rates = world.driver_qpos[closing], world.driver_qvel[closing]
         begin = self._unhindered(wanted, closing, direction) if self.calm else 0
-        goal = start.copy() if begin == 0 else wanted[begin - 1].copy()
-        data, ctrl, qpos = self.data, self.data.ctrl, self.data.qpos
-        # Few joints, many steps: plain numbers are several times faster than arrays, and as exact.
-        servos = list(zip(closing.tolist(), drivers.tolist(), direction.tolist(), end.tolist(), strict=True))
-        way, last, goals = wanted.tolist(), grasp.tolist(), goal.tolist()
-        joints = [sign * qpos.item(at) for _, at, sign, _ in servos]
+        servos.begin(start if begin == 0 else wanted[begin - 1])
+        way, last = wanted.tolist(), list(zip(grasp.tolist(), servos.rates, strict=True))
         for step in range(begin, steps + self._steps(motion.closing_time)):
             beside = min((step + 1 - steps) * speed, beyond)
-            aims = way[step] if step < steps else [angle + beside for angle in last]
-            for i, (servo, _, sign, stop) in enumerate(servos):
-                goals[i] = min(max(goals[i], min(aims[i], joints[i] + lead)), stop)
-                ctrl[servo] = sign * goals[i]
-            mujoco.mj_step(self.model, data)
-            joints = [sign * qpos.item(at) for _, at, sign, _ in servos]
+            servos.follow(way[step] if step < steps else [angle + rate * beside for angle, rate in last], lead)
+            mujoco.mj_step(self.model, self.data)
+            servos.read()
             if step % self.check == 0:
                 self._look()
-                goal = np.array(goals)
-                stalled = np.abs(data.qvel[rates]) < motion.stalled_speed
-                stalled &= (goal - np.array(joints) > motion.stalled_effort * lead) | (goal >= end)
-                if step >= steps and ((step + 1 - steps) * speed > beyond or stalled.all()):
+                stalled = step >= steps and servos.stalled(motion.stalled_effort * lead, motion.stalled_speed)
+                if stalled or (step >= steps and (step + 1 - steps) * speed > beyond):
                     break
-        if motion.overdrive is not None:
-            return
-        goal, steps = np.array(goals), self._steps(motion.squeeze_time)
+        if motion.overdrive is None:
+            self._squeeze(servos, speed)
+
+    def _squeeze(self, servos: ClosingServos, speed: float) -> None:
+        motion, error = self.protocol.motion, self.protocol.physics.servo_error
+        goal, steps = np.array(servos.goals), self._steps(motion.squeeze_time)
         squeeze = (motion.grip_effort - motion.closing_effort) * error
-        path = direction * np.minimum(goal + np.arange(1, steps + 1)[:, None] / steps * squeeze, end)
-        for step, angles in enumerate(path):
-            ctrl[closing] = angles
-            mujoco.mj_step(self.model, data)
+        path = np.minimum(goal + np.arange(1, steps + 1)[:, None] / steps * squeeze, servos.end)
+        most = (motion.synergy_effort or 0.0) * error
+        for step, aims in enumerate(path.tolist()):
+            share = (step + 1) / steps
+            lead = motion.closing_effort * error
+            servos.squeeze(aims, lead + (most - lead) * share, most, speed)
+            mujoco.mj_step(self.model, self.data)
+            servos.read()
             if step % self.check == 0:
                 self._look()
 

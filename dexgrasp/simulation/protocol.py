@@ -111,6 +111,9 @@ class Motion:
     """A closing joint slower than this stands still, rad/s or m/s."""
     stalled_effort: float = 0.9
     """It has stalled once it also pushes with more than this share of `closing_effort`."""
+    synergy_effort: float | None = None
+    """Fingers of several closing joints move along their synergy, and squeeze until their most loaded joint bears this
+    share of its limit, while no joint of the hand bears more; None: each joint closes and squeezes for itself."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ A plugin's whole test file, to be run by pytest::
         check(hand)
 
 The first argument's name says the kind: `hand`, `representation` or `backbone`. One test case is made per law; a
-representation is tried on every installed hand. A failed law says what was expected, what was found and what probably
+representation is tried on every installed hand, but those of which it says that it cannot tell their grasps
+(`UnsupportedHand`). A failed law says what was expected, what was found and what probably
 went wrong. Without pytest: `violations("hand", hand)`.
 """
 
@@ -51,6 +52,8 @@ def conforms(name: str, **options: Any) -> Callable[[Callable[[Any, Law], None]]
     """
     import pytest
 
+    from dexgrasp.errors import UnsupportedHand
+
     def decorate(test: Callable[[Any, Law], None]) -> Callable[..., None]:
         first = next(iter(inspect.signature(test).parameters), "")
         if first not in KINDS:
@@ -65,7 +68,11 @@ def conforms(name: str, **options: Any) -> Callable[[Callable[[Any, Law], None]]
 
         @pytest.mark.parametrize(("load", "law"), cases)
         def run(load: Callable[[], Any], law: Law) -> None:
-            test(load(), law)
+            try:
+                subject = load()
+            except UnsupportedHand as error:
+                pytest.skip(str(error))
+            test(subject, law)
 
         run.__name__, run.__doc__, run.__module__ = test.__name__, test.__doc__, test.__module__
         return run

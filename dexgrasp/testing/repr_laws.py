@@ -18,7 +18,7 @@ COUNT = 64
 
 def decode_of_encode_is_the_identity(representation: Representation) -> None:
     """Grasps that can be told come back, up to the representation's `resolution` (m, rad)."""
-    points, normals, grasps = samples.grasps(representation.hand, COUNT)
+    points, normals, grasps = samples.grasps(representation, COUNT)
     targets = representation.encode(points, normals, grasps)
     expect(
         targets.parameters.shape == (COUNT, representation.size),
@@ -49,7 +49,7 @@ def decode_of_encode_is_the_identity(representation: Representation) -> None:
 def which_fingers_touch_comes_back(representation: Representation) -> None:
     """A grasp that leaves some fingers open comes back with the same fingers open, or is not encodable."""
     hand = representation.hand
-    points, normals, grasps = samples.grasps(hand, COUNT, seed=40)
+    points, normals, grasps = samples.grasps(representation, COUNT, seed=40)
     grasps = grasps.replace(touching=samples.touching(hand, grasps.finger))
     targets = representation.encode(points, normals, grasps)
     expect(
@@ -79,7 +79,7 @@ def which_fingers_touch_comes_back(representation: Representation) -> None:
 
 def grasps_move_with_the_scene(representation: Representation) -> None:
     """Moving points, normals and grasps by one motion, encoding again and decoding moves the decoded grasps by it."""
-    points, normals, grasps = samples.grasps(representation.hand, COUNT, seed=10, lean=0.5)
+    points, normals, grasps = samples.grasps(representation, COUNT, seed=10, lean=0.5)
     motion = samples.motion(1, seed=11)[0]
     rotation = motion[:3, :3].T
     moved = (points @ rotation + motion[:3, 3], normals @ rotation, grasps.moved(motion))
@@ -159,7 +159,7 @@ def nothing_graspable_gives_a_finite_loss(representation: Representation) -> Non
 
 def points_do_not_depend_on_each_other(representation: Representation) -> None:
     """Encoding, heads (in eval) and decoding treat each point alike, alone or in company."""
-    points, normals, grasps = samples.grasps(representation.hand, 12, seed=20)
+    points, normals, grasps = samples.grasps(representation, 12, seed=20)
     model = copy.deepcopy(representation).eval()
     features = torch.randn(12, _channels(model), generator=torch.Generator().manual_seed(3))
     with torch.no_grad():
@@ -202,7 +202,7 @@ def _expect_same(found: Grasps, wanted: Grasps, representation: Representation, 
 
 def _targets(representation: Representation) -> Targets:
     """Targets of encodable grasps from every finger and of as many points that are not graspable."""
-    points, normals, grasps = samples.grasps(representation.hand, COUNT, seed=30)
+    points, normals, grasps = samples.grasps(representation, COUNT, seed=30)
     told = representation.encode(points, normals, grasps)
     fewer = grasps.replace(touching=samples.touching(representation.hand, grasps.finger))
     told = Targets.cat([told, representation.encode(points, normals, fewer)])

@@ -8,6 +8,7 @@ from torch.nn.functional import normalize
 from dexgrasp import geometry
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
+from dexgrasp.representation import Representation
 from dexgrasp.touching import finger_sets
 
 
@@ -30,14 +31,16 @@ Told = tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"], Grasps]
 """Contact point (m) and outward normal of the finger from which each grasp is told, and the grasps."""
 
 
-def grasps(hand: Hand, count: int, seed: int = 0, lean: float = 0.0) -> Told:
-    """Return random grasps, told in turn from each finger, whose fingertip circle touches a surface.
+def grasps(representation: Representation, count: int, seed: int = 0, lean: float = 0.0) -> Told:
+    """Return random grasps, told in turn from each finger, whose fingertip touches a surface.
+
+    Where on its surface it touches is the representation's model of it: `touching`.
 
     The surface normal lies in the finger's flexion plane and points 10 to 60 deg from the pad's direction towards
     the distal link, where every representation can tell the grasp; `lean` (rad) takes it out of that plane by up to
     that angle. Float64.
     """
-    generator = _generator(seed + 1)
+    generator, hand = _generator(seed + 1), representation.hand
     posture, pose = joints(hand, count, seed), motion(count, seed + 2)
     finger = torch.arange(count) % len(hand.fingers)
     tip = (pose.unsqueeze(1) @ hand.fingertips(posture))[torch.arange(count), finger]
@@ -45,8 +48,8 @@ def grasps(hand: Hand, count: int, seed: int = 0, lean: float = 0.0) -> Told:
     rise = 0.17 + 0.87 * torch.rand(count, 1, generator=generator, dtype=torch.float64)
     side = lean * (2 * torch.rand(count, 1, generator=generator, dtype=torch.float64) - 1)
     normals = side.cos() * (rise.cos() * v + rise.sin() * u) + side.sin() * w
-    radius = torch.tensor([f.tip_radius for f in hand.fingers], dtype=torch.float64)[finger]
-    points = tip[:, :3, 3] - radius.unsqueeze(-1) * normals
+    inward = -geometry.rotate(geometry.inverse(tip), normals)
+    points = geometry.transform(tip, representation.tip_contacts(finger, inward))
     quality = torch.rand(count, generator=generator, dtype=torch.float64)
     return points, normals, Grasps.build(pose, posture, len(hand.fingers), finger=finger, quality=quality)
 

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 import trimesh
 
+from dexgrasp.doctor.portrait import FROM, extent, link_colour
 from dexgrasp.execution import closing_direction
 from dexgrasp.hand import Hand
 from dexgrasp.simulation.hand_model import quaternion
@@ -34,6 +35,7 @@ class HandView:
         self.seen: list[Any] = []
         self._add_meshes()
         self._add_marks()
+        self._place_camera()
         self.sliders = self._add_sliders()
         self.move()
 
@@ -71,7 +73,13 @@ class HandView:
             place = f"/{self.name}/{link}"
             self.frames[link] = scene.add_frame(place, show_axes=False)
             if link in self.hand.visuals:
-                self.seen.append(scene.add_mesh_trimesh(f"{place}/visual", self.hand.visuals[link]))
+                seen, shade = self.hand.visuals[link], link_colour(self.hand, link)
+                self.seen.append(
+                    scene.add_mesh_simple(
+                        f"{place}/visual", np.asarray(seen.vertices, np.float32), np.asarray(seen.faces),
+                        color=shade, flat_shading=True,
+                    )
+                )  # fmt: skip
             for number, part in enumerate(self.hand.collisions.get(link, ())):
                 self.solids.append(
                     scene.add_mesh_simple(
@@ -79,6 +87,13 @@ class HandView:
                         color=SOLID, opacity=0.5, flat_shading=True, visible=False,
                     )
                 )  # fmt: skip
+
+    def _place_camera(self) -> None:
+        """Look at the whole hand, its approach upwards: the page's own camera stands metres away."""
+        palm, (center, radius) = self.hand.base_T_palm[:3, :3].numpy(), extent(self.hand)
+        self.server.scene.set_up_direction(tuple(palm[:, 2].tolist()))
+        camera = self.server.initial_camera
+        camera.look_at, camera.position = center, center + 1.6 * radius * palm @ FROM
 
     def _add_marks(self) -> None:
         palm = self.hand.base_T_palm.numpy()

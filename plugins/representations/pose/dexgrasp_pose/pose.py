@@ -117,7 +117,7 @@ class Pose(Representation):
         outputs = of_finger(prediction, finger)
         logits, residuals = outputs["joints"].unbind(-2)
         joints[:, self.told] = self.joints.join(logits, residuals, joint)
-        rotation = _orthonormal(outputs["rotation"])
+        rotation = geometry.orthonormal(outputs["rotation"])
         base = geometry.pose(rotation, points + self.scale * outputs["offset"])
         touching = told_fingers(self.hand, outputs.get("touching"), finger)
         return told_grasps(self.hand, points, normals, finger, base, joints, 1 - probability[:, 0], touching)
@@ -174,15 +174,3 @@ class Pose(Representation):
             outputs["touching"] = fingers_as_prediction(targets.parameters[:, -self.fingers :])
         finger = CERTAIN * F.one_hot(targets.finger, len(self.hand.fingers) + 1).to(targets.parameters)
         return {"finger": finger} | every_finger(outputs, self.versions)
-
-
-def _orthonormal(columns: Float[Tensor, "N 6"]) -> Float[Tensor, "N 3 3"]:
-    """Return right-handed rotations by Gram-Schmidt; parallel or zero columns fall back on the axes."""
-    eye = torch.eye(3).to(columns)
-    x = F.normalize(torch.where(columns[:, :3].norm(dim=-1, keepdim=True) < 1e-6, eye[0], columns[:, :3]), dim=-1)
-    y = columns[:, 3:] - (columns[:, 3:] * x).sum(-1, keepdim=True) * x
-    # The axis least along x is never parallel to it.
-    spare = eye[x.abs().argmin(-1)]
-    spare = spare - (spare * x).sum(-1, keepdim=True) * x
-    y = F.normalize(torch.where(y.norm(dim=-1, keepdim=True) < 1e-6, spare, y), dim=-1)
-    return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
