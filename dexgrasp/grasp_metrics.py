@@ -51,7 +51,8 @@ def grasp_metrics(
 
     Of contacts after closing: `epsilon`, `epsilon_linf`, `volume`, `spread` (m), `centred` (m). Of the posture as
     told: `penetration` (deepest point of the hand in the object, m), `self_penetration` (deepest overlap of two of its
-    fingers, m), `contact_distance` (mean over fingertips' links, at most 1 cm, m), `contact_count` (links within 2 mm).
+    fingers, m), `contact_distance` (mean over links of the fingertips that
+    are to touch, at most 1 cm, m), `contact_count` (links within 2 mm).
     """
     torsion = torsion_of(fewest_fingers(hand), None)
     found = contact_metrics(grasps, WrenchModel(tuple(item.com), item.radius, FRICTION, EDGES, torsion))
@@ -61,7 +62,7 @@ def grasp_metrics(
     return found | {
         "penetration": (-links.min(dim=1).values).clamp(min=0.0),
         "self_penetration": self_penetration(hand, grasps, physics),
-        "contact_distance": links[:, tips].clamp(0.0, FAR).mean(dim=1),
+        "contact_distance": links[:, tips].clamp(0.0, FAR).where(grasps.touching, torch.nan).nanmean(dim=1),
         "contact_count": (links.abs() < NEAR).double().sum(dim=1),
     }
 

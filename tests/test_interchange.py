@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dexgrasp import __main__ as cli
 from dexgrasp.errors import DexgraspError
+from dexgrasp.grasps import Grasps
 from dexgrasp.interchange.binding import Description, bind, renamed, unbound
 from dexgrasp.interchange.format import Format, Told
 from dexgrasp.interchange.formats import formats, read_grasps, write_grasps
@@ -348,6 +349,16 @@ def test_binding_to_a_hand(hand):
         bind(renamed(given, Description(joints={"finger_3": "thumb"})), hand)
     with pytest.raises(DexgraspError, match="between"):
         bind(GraspSet(**{**vars(given), "grasp": Posture(pose, np.degrees(values))}), hand)
+
+
+def test_open_fingers_stay_open_in_our_own_files(hand, tmp_path):
+    touching = torch.tensor([[True, True, True], [False, True, True]])
+    pose = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    made = Grasps.build(pose, hand.limits.mean(dim=1).repeat(2, 1), 3, touching=touching)
+    path = write_grasps(unbound(made, hand, ("a", "b")), tmp_path / "g.safetensors", "dexgrasp")
+    assert torch.equal(bind(read_grasps(path), hand).grasps.touching, touching)
+    bench = write_grasps(unbound(made, hand, ("a", "b")), tmp_path / "bench", "dexgraspbench")
+    assert bind(read_grasps(bench), hand).grasps.touching.all()
 
 
 def test_mapping_moves_the_base_and_turns_joints():

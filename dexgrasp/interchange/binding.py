@@ -106,7 +106,11 @@ def bind(grasps: GraspSet, hand: Hand) -> Bound:
     bodies = {body: number for number, body in enumerate(grasps.bodies())}
     owners = [bodies[body] for body in zip(grasps.objects, grasps.scale.tolist(), strict=True)]
     pose = torch.from_numpy(grasps.grasp.pose.copy())
-    made = Grasps.build(pose, hand.clamp(torch.from_numpy(joints)), len(hand.fingers))
+    touching = None if grasps.touching is None else torch.from_numpy(grasps.touching.copy())
+    if touching is not None and touching.shape != (len(grasps), len(hand.fingers)):
+        expected = f"which of the {len(hand.fingers)} fingers of {hand.name} touch in each grasp"
+        raise DexgraspError(expected, f"shape {tuple(touching.shape)}", "choose the right hand")
+    made = Grasps.build(pose, hand.clamp(torch.from_numpy(joints)), len(hand.fingers), touching=touching)
     score = torch.from_numpy(np.nan_to_num(grasps.score))
     made = made.replace(object=torch.tensor(owners, dtype=torch.long), quality=score)
     return Bound(made, uncoupled, int((beyond > 1e-9).any(axis=1).sum()))
@@ -131,4 +135,5 @@ def unbound(grasps: Grasps, hand: Hand, objects: tuple[str, ...]) -> GraspSet:
         grasp=Posture(poses, joints),
         scale=np.ones(len(grasps)),
         score=grasps.quality.double().cpu().numpy(),
+        touching=grasps.touching.cpu().numpy(),
     )

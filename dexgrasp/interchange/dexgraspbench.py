@@ -49,7 +49,7 @@ class DexGraspBench(Format):
         world = np.concatenate([part[2] for part in parts])
         back = np.linalg.inv(world)
         joint_names = names.pop()
-        postures = {
+        postures: dict[str, Any] = {
             stage: _posture(np.concatenate(given), back, len(joint_names), str(path))  # type: ignore[arg-type]
             for stage, given in stages.items()
             if all(each is not None for each in given)

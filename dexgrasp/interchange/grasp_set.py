@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from dexgrasp.errors import DexgraspError
 
@@ -53,6 +53,8 @@ class GraspSet:
     """Postures before and after, where the file tells them."""
     world_T_object: Float[Array, "N 4 4"] | None = field(default=None)
     """Where the objects stood, m; None: in their own frames."""
+    touching: Bool[Array, "N F"] | None = field(default=None)
+    """Which fingers close until they touch, in the hand's order; None: all. Only our own files tell."""
 
     def __post_init__(self) -> None:
         count = len(self.objects)
@@ -70,6 +72,10 @@ class GraspSet:
             _finite(posture.joints, f"joints of the {what}")
         if self.world_T_object is not None:
             _check_rigid(self.world_T_object, "object")
+        if self.touching is not None and len(self.touching) != count:
+            raise DexgraspError(
+                f"touching fingers of {count} grasps", f"of {len(self.touching)}", "give one row a grasp"
+            )
         if len(self.scale) != count or len(self.score) != count or len(self.names) != count:
             raise DexgraspError(f"{count} scales, scores and names", "other numbers of them", "give one a grasp")
         if not (np.isfinite(self.scale).all() and (self.scale > 0).all()):

@@ -11,7 +11,7 @@ from dexgrasp.interchange.format import Format, Told
 from dexgrasp.interchange.grasp_set import GraspSet, Posture
 
 SCHEMA = "dexgrasp.grasps/1"
-ARRAYS = ("scale", "score", "world_T_object")
+ARRAYS = ("scale", "score", "world_T_object", "touching")
 STAGES = ("grasp", "pregrasp", "squeeze")
 
 
@@ -41,6 +41,8 @@ class Native(Format):
                 if f"{stage}.pose" in arrays
             }
             given: dict[str, Any] = {key: arrays[key] for key in ARRAYS if key in arrays}
+            if "touching" in given:
+                given["touching"] = given["touching"] > 0
             texts: dict[str, Any] = {key: tuple(header[key]) for key in ("joint_names", "objects", "names")}
             return GraspSet(hand=header["hand"], **texts, **given, **stages)
         except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
@@ -101,4 +103,5 @@ class DatasetGrasps(Format):
             grasp=Posture(pose, joints),
             scale=np.ones(len(pose)),
             score=quality,
+            touching=np.concatenate([part.touching.numpy() for part in parts]),
         )
