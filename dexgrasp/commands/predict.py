@@ -38,14 +38,20 @@ def main(config: DictConfig) -> None:
             "joint_names": names,
             "frame": "camera (x right, y down, z forward), metres, radians",
             "seconds": seconds,
-            "grasps": [
-                {"score": float(g.quality[0]), "pose": g.pose[0].tolist(), "joints": g.joints[0].tolist()}
-                for g in (grasps[i] for i in range(len(grasps)))
-            ],
+            "grasps": [_told(grasps[i], [finger.name for finger in model.hand.fingers]) for i in range(len(grasps))],
         },
     )
     print(table(grasps, names))
     print(f"{len(grasps)} grasps in {seconds:.2f} s\n{folder}")
+
+
+def _told(grasp: Grasps, fingers: list[str]) -> dict[str, Any]:
+    return {
+        "score": float(grasp.quality[0]),
+        "pose": grasp.pose[0].tolist(),
+        "joints": grasp.joints[0].tolist(),
+        "fingers": [name for name, touches in zip(fingers, grasp.touching[0].tolist(), strict=True) if touches],
+    }
 
 
 def table(grasps: Grasps, names: tuple[str, ...]) -> str:
