@@ -115,7 +115,7 @@ def test_a_link_that_is_not_there(command, tmp_path):
     [
         (["train", "trainer.stepz=3"], ["'trainer.stepz'", r"did you mean 'trainer\.steps'"]),
         (["train", "dataset.scenes.cuont=3"], ["cuont", r"did you mean 'dataset\.scenes\.count'"]),
-        (["train", "repr=contakt"], ["contact, pose", "did you mean 'contact'", "plugins"]),
+        (["train", "repr=contakt"], ["contact, .*pose", "did you mean 'contact'", "plugins"]),
         (["train", "dataset=smok"], ["did you mean 'smoke'", "train --help"]),
         (["train", "+trainer.colour=3"], ["keys of trainer", "colour"]),
         (["train", "+dataset.synthesis.colour=3"], [r"keys of dataset\.synthesis", "colour"]),
@@ -171,7 +171,7 @@ def checkpoint(tmp_path_factory):
     hand, backbone = load_hand("barrett"), load_backbone("pointnet", points=32)
     representation = load_representation("contact", hand, backbone.channels, hidden=[16])
     parts = {
-        "hand": {"name": "barrett", "urdf": str(hand.urdf), "shared": ["spread"], "palm": "palm", "fingers": [
+        "hand": {"name": "barrett", "urdf": str(hand.urdf), "shared": ["spread"], "palm": "palm", "least_fingers": 3, "fingers": [
             {"name": f"finger_{i + 1}", "link": link} for i, link in enumerate(FINGERS)]},
         "repr": {"name": "contact", "hidden": [16]},
         "backbone": {"name": "pointnet", "points": 32},
