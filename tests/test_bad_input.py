@@ -171,7 +171,8 @@ def checkpoint(tmp_path_factory):
     hand, backbone = load_hand("barrett"), load_backbone("pointnet", points=32)
     representation = load_representation("contact", hand, backbone.channels, hidden=[16])
     parts = {
-        "hand": {"name": "barrett", "urdf": str(hand.urdf), "shared": ["spread"], "palm": "palm", "least_fingers": 3, "fingers": [
+        "hand": {"name": "barrett", "urdf": str(hand.urdf), "shared": ["spread"], "palm": "palm",
+            "least_fingers": 3, "fingers": [
             {"name": f"finger_{i + 1}", "link": link} for i, link in enumerate(FINGERS)]},
         "repr": {"name": "contact", "hidden": [16]},
         "backbone": {"name": "pointnet", "points": 32},
