@@ -20,7 +20,10 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
     centre = rate + Z**2 / (2 * trials)
     spread = Z * np.sqrt(rate * (1 - rate) / trials + Z**2 / (4 * trials**2))
     scale = 1 + Z**2 / trials
-    return float(max(0.0, (centre - spread) / scale)), float(min(1.0, (centre + spread) / scale))
+    # Without a failure, or a success, one end is the rate itself, but for rounding.
+    low = 0.0 if successes == 0 else float((centre - spread) / scale)
+    high = 1.0 if successes == trials else float((centre + spread) / scale)
+    return low, high
 
 
 def bootstrap_ratio(

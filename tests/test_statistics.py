@@ -9,6 +9,8 @@ def test_wilson_known_values():
     assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
     assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
     assert wilson(0, 0) == (0.0, 1.0)
+    for trials in range(1, 60):  # without successes or failures an end is the rate, whatever the rounding
+        assert wilson(0, trials)[0] == 0.0 and wilson(trials, trials)[1] == 1.0
 
 
 def test_bootstrap_covers_and_repeats():
