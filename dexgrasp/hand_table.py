@@ -92,4 +92,6 @@ def _cell(row: Mapping[str, Any], key: str) -> str:
         if value is None:
             return "-"
         return f"{100 * value:.0f} [{100 * row[f'{key}_low']:.0f}, {100 * row[f'{key}_high']:.0f}]"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
