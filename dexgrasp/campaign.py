@@ -29,8 +29,7 @@ from dexgrasp.settings import read
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.statistics import rate_interval
-from dexgrasp.touching import fewest_fingers
-from dexgrasp.wrench_model import WrenchModel, torsion_of
+from dexgrasp.wrench_model import WrenchModel
 
 
 @dataclass(frozen=True)
@@ -94,8 +93,8 @@ class Campaign:
         start = opened(dataset.hand, grasp.joints.double(), self.protocol.motion.opening, touching)
         base = inverse(pose.double()) @ grasp.pose.double()
         closure = dataset.closer.close(field, base, start, centred=True, touching=touching)
-        torsion = torsion_of(fewest_fingers(dataset.hand), synthesis.get("torsion"))
-        model = WrenchModel(tuple(item.com), item.radius, synthesis["friction"], synthesis["edges"], torsion)
+        told = synthesis["friction"], synthesis["edges"], synthesis.get("torsion")
+        model = WrenchModel.about(item, dataset.hand, *told)
         return float(model.epsilon(closure.contacts, closure.normals).values[0])
 
 

@@ -21,8 +21,7 @@ from dexgrasp.objects import Object
 from dexgrasp.seeds import stream
 from dexgrasp.simulation.protocol import Physics
 from dexgrasp.simulation.world import World
-from dexgrasp.touching import fewest_fingers
-from dexgrasp.wrench_model import WrenchModel, torsion_of
+from dexgrasp.wrench_model import WrenchModel
 
 FRICTION, EDGES = 0.5, 8
 """Of the contacts' cones; torques about the centre of mass over the largest radius."""
@@ -54,8 +53,7 @@ def grasp_metrics(
     fingers, m), `contact_distance` (mean over links of the fingertips that
     are to touch, at most 1 cm, m), `contact_count` (links within 2 mm).
     """
-    torsion = torsion_of(fewest_fingers(hand), None)
-    found = contact_metrics(grasps, WrenchModel(tuple(item.com), item.radius, FRICTION, EDGES, torsion))
+    found = contact_metrics(grasps, WrenchModel.about(item, hand, FRICTION, EDGES))
     links = shape.link_distances(field, grasps.pose, grasps.joints)
     names = [record.name for record in hand.tree]  # type: ignore[attr-defined]
     tips = [names.index(finger.link) for finger in hand.fingers]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -11,6 +11,8 @@ from torch import Tensor
 from dexgrasp import quality
 from dexgrasp.contact_wrenches import cone_edges
 from dexgrasp.errors import DexgraspError
+from dexgrasp.hand import Hand
+from dexgrasp.touching import fewest_fingers
 
 Array = Tensor | np.ndarray
 HULLS = ("l1", "linf")
@@ -23,6 +25,18 @@ TWO_FINGERS = 0.02
 def torsion_of(least: int, torsion: float | None) -> float:
     """Return the torsion (m) of a hand of which at least so many fingers touch; `torsion` where it is given."""
     return (TWO_FINGERS if least == 2 else 0.0) if torsion is None else torsion
+
+
+class Body(Protocol):
+    """What a wrench model must know of an object."""
+
+    @property
+    def com(self) -> np.ndarray:
+        """Centre of mass, m, in the frame of the contacts."""
+
+    @property
+    def radius(self) -> float:
+        """Largest distance from it to the surface, m."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +66,14 @@ class WrenchModel:
                 str(asdict(self)),
                 "mend the wrench model",
             )
+
+    @classmethod
+    def about(
+        cls, body: Body, hand: Hand, friction: float = 0.5, edges: int = 8, torsion: float | None = None
+    ) -> "WrenchModel":
+        """Return the model of a hand's grasps of a body, torques about its centre of mass (torsion None: the hand's)."""
+        torsion = torsion_of(fewest_fingers(hand), torsion)
+        return cls(tuple(body.com), body.radius, friction, edges, torsion)
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> "WrenchModel":

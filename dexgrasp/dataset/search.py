@@ -22,8 +22,8 @@ from dexgrasp.hand_body import hand_body
 from dexgrasp.headroom import headroom
 from dexgrasp.objects import Object
 from dexgrasp.preview import BURIED, MISSED, SEEN, Preview
-from dexgrasp.touching import closing_groups, fewest_fingers, finger_sets
-from dexgrasp.wrench_model import WrenchModel, torsion_of
+from dexgrasp.touching import closing_groups, finger_sets
+from dexgrasp.wrench_model import WrenchModel
 
 PASS = 1.0
 """Hands are closed whose preview promises this much of the wanted epsilon: closing is dear, and seldom finds more."""
@@ -54,8 +54,7 @@ class Search:
         self.hand, self.item, self.surface, self.settings = hand, item, surface, settings
         self.body, self.shape, self.preview = hand_body(hand), HandShape(hand), Preview(hand)
         self.centring = Centring(hand)
-        torsion = torsion_of(fewest_fingers(hand), settings.torsion)
-        self.model = WrenchModel(tuple(item.com), item.radius, settings.friction, settings.edges, torsion)
+        self.model = WrenchModel.about(item, hand, settings.friction, settings.edges, settings.torsion)
         share, sets = settings.approach, finger_sets(hand, settings.least_fingers, settings.most_fingers)
         self.least = int(sets.sum(dim=1).min())
         groups = np.array(closing_groups(hand))

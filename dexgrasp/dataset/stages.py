@@ -32,8 +32,7 @@ from dexgrasp.seeds import stream
 from dexgrasp.settings import read
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import load_protocol
-from dexgrasp.touching import fewest_fingers
-from dexgrasp.wrench_model import WrenchModel, torsion_of
+from dexgrasp.wrench_model import WrenchModel
 
 
 def key(index: int) -> str:
@@ -108,8 +107,7 @@ def make_verdicts(dataset: Dataset, index: int) -> Item:
     rng = stream(dataset.config["seed"], "verdicts", item.name)
     found = verify(dataset.hand, dataset.shape, item, grasps, settings.verify, settings.approach, rng)
     synthesis = settings.synthesis
-    torsion = torsion_of(fewest_fingers(dataset.hand), synthesis.torsion)
-    model = WrenchModel(tuple(item.com), item.radius, synthesis.friction, synthesis.edges, torsion)
+    model = WrenchModel.about(item, dataset.hand, synthesis.friction, synthesis.edges, synthesis.torsion)
     told = metrics(grasps[found.grasp], model)
     tensors = found.tensors() | {METRIC + name: value.float() for name, value in told.items()}
     facts = {"name": item.name, "grasps": len(grasps)} | signature(settings.verify.rules) | tally(found.reason)

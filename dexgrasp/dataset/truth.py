@@ -14,8 +14,7 @@ from dexgrasp.distance import DistanceField
 from dexgrasp.execution import opened
 from dexgrasp.geometry import inverse, rotation_angle
 from dexgrasp.grasps import Grasps
-from dexgrasp.touching import fewest_fingers
-from dexgrasp.wrench_model import WrenchModel, torsion_of
+from dexgrasp.wrench_model import WrenchModel
 
 if TYPE_CHECKING:
     from dexgrasp.closing import Closer, Closure
@@ -137,8 +136,7 @@ class Truth:
 
     def _model(self, body: Body) -> WrenchModel:
         limits = self.settings
-        torsion = torsion_of(fewest_fingers(self.closer.hand), limits.torsion)
-        return WrenchModel(tuple(body.com), body.radius, limits.friction, limits.edges, torsion)
+        return WrenchModel.about(body, self.closer.hand, limits.friction, limits.edges, limits.torsion)
 
     def _closed_quality(self, grasps: Grasps, index: int) -> Float[Tensor, "N"]:
         """Return epsilon of grasps of one object after closing again; 0 where a check fails."""

@@ -15,8 +15,7 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.execution import opened
 from dexgrasp.grasps import Grasps
 from dexgrasp.seeds import stream
-from dexgrasp.touching import fewest_fingers
-from dexgrasp.wrench_model import WrenchModel, torsion_of
+from dexgrasp.wrench_model import WrenchModel
 
 SCHEMAS: dict[str, dict[str, tuple[str | int, ...]]] = {
     "objects": {"vertices": ("v", 3), "faces": ("f", 3), "com": (3,), "size": (2,), "stable_poses": ("k", 4, 4)},
@@ -96,7 +95,6 @@ def rechecked(dataset: Dataset, grasps: int, scenes: int, seed: int = 0) -> Iter
 
 def _grasps(dataset: Dataset, count: int, seed: int) -> Iterator[Check]:
     settings = stages.settings_of(dataset).synthesis
-    torsion = torsion_of(fewest_fingers(dataset.hand), settings.torsion)
     kept = np.array([len(dataset.grasps(i)) for i in range(len(dataset.store("grasps")))])
     if not kept.sum():
         yield Check("grasps", True, "none are there")
@@ -108,7 +106,7 @@ def _grasps(dataset: Dataset, count: int, seed: int) -> Iterator[Check]:
         own = dataset.grasps(int(number))[torch.from_numpy(drawn[owner == number] - (kept.cumsum() - kept)[number])]
         own = own.to(torch.float64)
         body = dataset.body(int(number))
-        model = WrenchModel(tuple(body.com), body.radius, settings.friction, settings.edges, torsion)
+        model = WrenchModel.about(body, dataset.hand, settings.friction, settings.edges, settings.torsion)
         errors.append((torch.as_tensor(model.epsilon(own.contacts, own.normals).values) - own.quality).abs())
         least.append(own.quality)
         start = opened(dataset.hand, own.joints, settings.opening, own.touching)
