@@ -1,6 +1,6 @@
-"""Hands, representations and backbones by name or from a composed config.
+"""Hands, representations, backbones and planners by name or from a composed config.
 
-A plugin is an entry point of one of three groups. Its value names a class, or for a hand a package that holds only a
+A plugin is an entry point of one of four groups. Its value names a class, or for a hand a package that holds only a
 YAML and a URDF. Its YAML, ``<package>/conf/<kind>/<name>.yaml``, has the key `name`, which picks the entry point, and
 constructor arguments.
 """
@@ -17,12 +17,14 @@ from dexgrasp.registry import GROUPS, conf_folder, conf_folders, find, installed
 if TYPE_CHECKING:
     from dexgrasp.backbone import Backbone
     from dexgrasp.hand import Hand
+    from dexgrasp.planner import Planner
     from dexgrasp.representation import Representation
 
 __all__ = [
     "GROUPS",
     "build_backbone",
     "build_hand",
+    "build_planner",
     "build_representation",
     "conf_folders",
     "hand_options",
@@ -30,6 +32,7 @@ __all__ = [
     "load_backbone",
     "load_class",
     "load_hand",
+    "load_planner",
     "load_representation",
     "names",
     "read",
@@ -59,6 +62,11 @@ def load_backbone(name: str, **options: Any) -> "Backbone":
     return build_backbone(_options("backbone", name, options))
 
 
+def load_planner(name: str, hand: "Hand", **options: Any) -> "Planner":
+    """Return the planner `name` for `hand`; `options` replace keys of its YAML."""
+    return build_planner(_options("planner", name, options), hand)
+
+
 def build_hand(config: Mapping[str, Any]) -> "Hand":
     """Return the hand of a composed config: `name` picks the entry point, other keys are constructor arguments.
 
@@ -85,6 +93,12 @@ def build_backbone(config: Mapping[str, Any]) -> "Backbone":
     """Return the backbone of a composed config, as `build_hand`."""
     options = _resolved("backbone", config)
     return _construct(load_class("backbone", options["name"]), options)
+
+
+def build_planner(config: Mapping[str, Any], hand: "Hand") -> "Planner":
+    """Return the planner of a composed config for `hand`, as `build_hand`."""
+    options = _resolved("planner", config)
+    return _construct(load_class("planner", options["name"]), options, hand)
 
 
 def _options(kind: str, name: str, overrides: Mapping[str, Any]) -> dict[str, Any]:

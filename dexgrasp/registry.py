@@ -10,7 +10,12 @@ from pathlib import Path
 
 from dexgrasp.errors import DexgraspError
 
-GROUPS = {"hand": "dexgrasp.hands", "repr": "dexgrasp.representations", "backbone": "dexgrasp.backbones"}
+GROUPS = {
+    "hand": "dexgrasp.hands",
+    "repr": "dexgrasp.representations",
+    "backbone": "dexgrasp.backbones",
+    "planner": "dexgrasp.planners",
+}
 """Entry-point group of each kind; the kind is also the name of the config group."""
 
 
@@ -160,6 +165,10 @@ def _base(kind: str) -> type:
         from dexgrasp.representation import Representation
 
         return Representation
+    if kind == "planner":
+        from dexgrasp.planner import Planner
+
+        return Planner
     from dexgrasp.backbone import Backbone
 
     return Backbone

@@ -71,7 +71,7 @@ class WrenchModel:
     def about(
         cls, body: Body, hand: Hand, friction: float = 0.5, edges: int = 8, torsion: float | None = None
     ) -> "WrenchModel":
-        """Return the model of a hand's grasps of a body, torques about its centre of mass (torsion None: the hand's)."""
+        """Return the model of a hand's grasps of a body: torques about its centre of mass; torsion None, the hand's."""
         torsion = torsion_of(fewest_fingers(hand), torsion)
         return cls(tuple(body.com), body.radius, friction, edges, torsion)
 
