@@ -1,5 +1,7 @@
 """An evaluation in full: every held-out scene cleared, beside the ceilings that its labels set."""
 
+import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -15,12 +17,15 @@ from dexgrasp.dataset.camera import MeshScene, Viewpoints
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.framing import Framing
 from dexgrasp.dataset.sensor import Sensor, capture
-from dexgrasp.evaluation import Episode, Policy, attempt_rows, ceilings, clear, rate, summarise
+from dexgrasp.evaluation import Episode, Policy, attempt_rows, ceilings, clear, episode_rows, rate, summarise
 from dexgrasp.execution import opened
 from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
+from dexgrasp.hand import Hand
 from dexgrasp.model import GraspNet, load_model
 from dexgrasp.objects import Object
+from dexgrasp.planner import Planner, Situation
+from dexgrasp.plugins import build_planner
 from dexgrasp.progress import track
 from dexgrasp.scene import View
 from dexgrasp.seeds import stream
@@ -39,11 +44,14 @@ class Campaign:
     dataset: Dataset
     """Held-out objects with their grasps and scenes."""
     protocol: Protocol
-    model: Path
+    model: Path | None
+    """Checkpoint of the network; None: `planner` grasps."""
     policy: Policy
     selection: Selection
     top_k: int
     seed: int
+    planner: Mapping[str, Any] | None = None
+    """Resolved config of the group `planner`."""
     drawn: int = 8
     """Scenes whose attempts are kept for pictures."""
 
@@ -65,6 +73,7 @@ class Campaign:
             "top_k": self.top_k,
             "seed": self.seed,
             "summary": summarise(episodes, self.seed),
+            "episodes": episode_rows(episodes),
             "attempts": attempt_rows(episodes),
         }
         if label_ceilings:
@@ -80,11 +89,17 @@ class Campaign:
         seen = MeshScene([item.mesh for item in objects], poses, self.dataset.scene(scene).fixtures)
         return capture(seen, cameras, Sensor.build(config["camera"]), framing, stream(seed, "sensor"))
 
-    def predict(self, view: View) -> Grasps:
-        """Return the grasps that the network offers and that are worth trying, camera frame."""
-        network = _network(self.model, self.model.stat().st_mtime_ns)
+    def predict(self, situation: Situation) -> Grasps:
+        """Return the grasps that network or planner offer and that are worth trying, camera frame."""
+        if self.model is None:
+            return self._planner().plan(situation, self.top_k)
+        view, network = situation.view, _network(self.model, self.model.stat().st_mtime_ns)
         grasps = network.predict(view.points, view.normals, self.top_k, self.selection, self.seed)
         return grasps if network.scorer is None else grasps[grasps.quality >= self.policy.min_lift]
+
+    def _planner(self) -> Planner:
+        assert self.planner is not None
+        return _planner(json.dumps(dict(self.planner), sort_keys=True), self.dataset.hand)
 
     def reached(self, item: Object, pose: Float[Tensor, "4 4"], grasp: Grasps) -> float:
         """Return epsilon of the contacts in which the fingers end on the true mesh, torque about its centre of mass."""
@@ -137,6 +152,11 @@ def _work(campaign: Campaign, index: int, label_ceilings: bool) -> tuple[Episode
 def _network(path: Path, stamp: int) -> GraspNet:
     """`stamp` tells a file from an older one of that name."""
     return load_model(path)
+
+
+@lru_cache(1)
+def _planner(config: str, hand: Hand) -> Planner:
+    return build_planner(json.loads(config), hand)
 
 
 def _ceiling_rates(verdicts: list[dict[str, list[bool]]], seed: int) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from dexgrasp.geometry import inverse, rotation_angle
 from dexgrasp.grasps import Grasps, Reason
 from dexgrasp.hand import Hand
 from dexgrasp.objects import Object
+from dexgrasp.planner import Situation
 from dexgrasp.scene import Boxes, View
 from dexgrasp.seeds import stream
 from dexgrasp.simulation.protocol import Protocol
@@ -25,7 +26,7 @@ from dexgrasp.statistics import bootstrap_ratio, rate_interval
 
 Look = Callable[[Sequence[Object], Float[Tensor, "O 4 4"], int], View]
 """Renders the objects at their poses; the last argument seeds camera and noise."""
-Predict = Callable[[View], Grasps]
+Predict = Callable[[Situation], Grasps]
 """Returns grasps in the camera frame, best first."""
 Epsilon = Callable[[Object, Float[Tensor, "4 4"], Grasps], float]
 """Returns the epsilon quality that one grasp (world frame) reaches on an object at a pose."""
@@ -102,9 +103,11 @@ def clear(
     budget = math.floor(policy.attempts_per_object * len(objects))
     while len(attempts) < budget and len(standing := present(poses)) > protocol.verdict.stop_at:
         began = time.perf_counter()
-        view = look([objects[i] for i in standing], poses[standing], _seed(seed, "look", index, len(attempts)))
+        there, drawn = tuple(objects[i] for i in standing), _seed(seed, "look", index, len(attempts))
+        view = look(there, poses[standing], drawn)
         looked = time.perf_counter()
-        offered = predict(view).moved(view.world_T_camera)
+        situation = Situation(view, there, poses[standing].double(), fixtures, drawn)
+        offered = predict(situation).moved(view.world_T_camera)
         chosen = choose(offered[~tilted(hand, offered, protocol.verdict.max_tilt)], failed, policy)
         predicted = time.perf_counter()
         seconds = {"render": looked - began, "predict": predicted - looked}
@@ -225,6 +228,11 @@ def rate(top: float, bottom: int, interval: tuple[float, float]) -> dict[str, An
 def attempt_rows(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
     """Return every attempt as plain values, for results.json."""
     return [asdict(attempt) for episode in episodes for attempt in episode.attempts]
+
+
+def episode_rows(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
+    """Return of every scene which objects were there and which were removed, for results.json."""
+    return [{"scene": e.scene, "present": e.present, "removed": e.removed} for e in episodes]
 
 
 def _target(grasp: Grasps, view: View) -> int | None:
