@@ -15,6 +15,7 @@ PIPELINES = {
     "train": "train a network, evaluate it in physics, show the result",
     "eval": "a network (model=RUN) or planner (planner=NAME) in physics; grasps=FILE: a set under several protocols",
     "fit": "teach a planner (a baseline that learns) on a dataset",
+    "study": "compare methods under several rules, in tables: experiment=quick_benchmark",
     "predict": "grasps for one point cloud or depth image",
     "fidelity": "how much of a grasp each representation keeps",
 }

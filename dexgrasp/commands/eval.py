@@ -55,7 +55,7 @@ def main(config: DictConfig) -> None:
     """Evaluate `config.model` or `config.planner` and print where the report lies."""
     Settings.of(config)
     folder = Path(HydraConfig.get().runtime.output_dir)
-    if (config.model is None) == (config.planner is None):
+    if (config.model is None) == (config.get("planner") is None):
         found = "neither" if config.model is None else "both"
         expected = "a trained network (model=RUN) or a planner (planner=NAME hand=NAME)"
         raise DexgraspError(expected, found, "give one; `python -m dexgrasp plugins planner` lists planners")
@@ -63,7 +63,7 @@ def main(config: DictConfig) -> None:
         checkpoint = find_checkpoint(config.model)
         hand = read_tensors(checkpoint)[1]["config"]["hand"]
         results = evaluate(config, hand, checkpoint, folder)
-    elif config.hand is None:
+    elif config.get("hand") is None:
         raise DexgraspError("the hand for which the planner plans", "none", "add hand=NAME, for example hand=barrett")
     else:
         build_planner(config.planner, build_hand(config.hand))  # what is wrong with it is told before data are made

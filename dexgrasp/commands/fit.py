@@ -16,7 +16,7 @@ from dexgrasp.report import write_results
 def main(config: DictConfig) -> None:
     """Make the dataset where it is missing, fit `config.planner` to it; all it learns lies in the run's folder."""
     began = time.perf_counter()
-    if config.planner is None:
+    if config.get("planner") is None:
         raise DexgraspError("the planner to teach", "none", "add planner=NAME; `python -m dexgrasp plugins planner`")
     folder = Path(HydraConfig.get().runtime.output_dir)
     hand = build_hand(config.hand)
