@@ -12,12 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dexgrasp.ceilings import ceilings
 from dexgrasp.child import end_with_parent
 from dexgrasp.dataset.camera import MeshScene, Viewpoints
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.framing import Framing
 from dexgrasp.dataset.sensor import Sensor, capture
-from dexgrasp.evaluation import Episode, Policy, attempt_rows, ceilings, clear, episode_rows, rate, summarise
+from dexgrasp.evaluation import Episode, Policy, attempt_rows, clear, episode_rows, rate, summarise
 from dexgrasp.execution import opened
 from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
@@ -52,6 +53,8 @@ class Campaign:
     seed: int
     planner: Mapping[str, Any] | None = None
     """Resolved config of the group `planner`."""
+    oracle: int = 0
+    """Labels of each object that the oracle may try, see `ceilings`."""
     drawn: int = 8
     """Scenes whose attempts are kept for pictures."""
 
@@ -122,12 +125,10 @@ def _work(campaign: Campaign, index: int, label_ceilings: bool) -> tuple[Episode
         simulator = MujocoSimulator(dataset.config["simulator"]["settling"])
         objects = [dataset.objects[name] for name in dataset.scene(index).objects]
         poses, fixtures = dataset.scene(index).poses.double(), dataset.scene(index).fixtures
-        common = (dataset.hand, simulator, campaign.protocol)
-        verdicts = (
-            ceilings(index, objects, poses, dataset.scene_grasps(index), *common, campaign.seed, fixtures)
-            if label_ceilings
-            else {}
-        )
+        verdicts: dict[str, list[bool]] = {}
+        if label_ceilings:
+            labels, rules = dataset.scene_grasps(index), (dataset.hand, simulator, campaign.protocol, campaign.seed)
+            verdicts = ceilings(index, objects, poses, labels, *rules, fixtures, campaign.oracle)
         episode = clear(
             index,
             objects,

@@ -159,38 +159,6 @@ def choose(offered: Grasps, failed: Sequence[Grasps], policy: Policy) -> Grasps 
     return offered[int(fresh.nonzero()[0, 0])] if fresh.any() else None
 
 
-def ceilings(
-    index: int,
-    objects: Sequence[Object],
-    poses: Float[Tensor, "O 4 4"],
-    labels: Grasps,
-    hand: Hand,
-    simulator: Simulator,
-    protocol: Protocol,
-    seed: int,
-    fixtures: Boxes | None = None,
-) -> dict[str, list[bool]]:
-    """Execute, for each object of the untouched scene, its best label by epsilon and a random one.
-
-    `labels` are the feasible grasps of the scene (world frame); an object without any is not counted.
-    """
-    chosen: dict[str, list[Grasps]] = {"best_epsilon": [], "random": []}
-    steep = tilted(hand, labels, protocol.verdict.max_tilt)
-    for row in range(len(objects)):
-        own = ((labels.object == row) & ~steep).nonzero().flatten()
-        if len(own) == 0:
-            continue
-        chosen["best_epsilon"].append(labels[int(own[labels.quality[own].argmax()])])
-        chosen["random"].append(labels[int(own[int(stream(seed, "ceiling", index, row).integers(len(own)))])])
-    verdicts: dict[str, list[bool]] = {}
-    for kind, grasps in chosen.items():
-        outcomes = (
-            simulator.execute(objects, poses, hand, Grasps.cat(grasps), protocol, fixtures=fixtures) if grasps else None
-        )
-        verdicts[kind] = [] if outcomes is None else [bool(x) for x in outcomes.success]
-    return verdicts
-
-
 def summarise(episodes: Sequence[Episode], seed: int) -> dict[str, Any]:
     """Return SR, CR and epsilon with 95 % intervals (`statistics.rate_interval` over scenes)."""
     wins = [sum(a.success for a in e.attempts) for e in episodes]

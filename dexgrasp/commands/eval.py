@@ -39,7 +39,7 @@ class Settings:
         """Return the settings of a composed config; raises DexgraspError for what is wrong in it."""
         options = OmegaConf.to_container(config.evaluation, resolve=True)
         assert isinstance(options, dict)
-        for key in ("top_k", "drawn"):
+        for key in ("top_k", "drawn", "oracle"):
             if type(options[key]) is not int or options[key] < 0:
                 raise DexgraspError(f"evaluation.{key} to be a whole number", repr(options[key]), "set it so")
         stages.Settings.read(options["dataset"])
@@ -94,6 +94,7 @@ def evaluate(config: DictConfig, hand: Mapping[str, Any], checkpoint: Path | Non
         top_k=options["top_k"],
         seed=config.seed,
         drawn=options["drawn"],
+        oracle=options["oracle"],
     )
     workers = options["workers"] or len(os.sched_getaffinity(0))
     episodes, results = campaign.run(workers, options["ceilings"])
