@@ -1,6 +1,5 @@
 """What contact_roll, grasp_type and contact_width add to the laws that every representation obeys."""
 
-
 import pytest
 import torch
 from dexgrasp_contact_roll import ContactRoll
