@@ -25,6 +25,7 @@ TOOLS = {
     "plugins": "list installed hands, representations and backbones",
     "hand": "hand check <name>: look a hand over; hand init <file>: write one from a URDF",
     "convert": "other people's grasps: what is in a file, and into another format: convert <file> [--to FILE]",
+    "view": "look at a dataset, prediction, evaluation or hand in the browser: view PATH [--scene 3]",
     "report": "one leaderboard over any set of runs, HTML and Markdown: report RUN...",
 }
 """Ordinary arguments."""

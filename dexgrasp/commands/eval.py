@@ -19,6 +19,7 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.evaluation import Policy
 from dexgrasp.fingerprint import scenes_hash
 from dexgrasp.plugins import build_hand, build_planner
+from dexgrasp.replay import write_replay
 from dexgrasp.report import draw_attempts, rows, write_report, write_results
 from dexgrasp.selection import Selection
 from dexgrasp.settings import read
@@ -112,6 +113,7 @@ def evaluate(config: DictConfig, hand: Mapping[str, Any], checkpoint: Path | Non
     }
     folder.mkdir(parents=True, exist_ok=True)
     write_results(folder, "evaluation", results)
+    write_replay(folder, episodes, dataset)
     write_report(folder, results, draw_attempts(folder, episodes, dataset.objects, dataset.hand))
     return results
 

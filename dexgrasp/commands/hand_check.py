@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import time
 from datetime import datetime
 from pathlib import Path
 
@@ -58,13 +57,8 @@ def run(chosen: argparse.Namespace) -> int:
 
 def _show(hand, port: int) -> None:  # type: ignore[no-untyped-def]
     """Show the hand in the browser until Ctrl-C."""
-    from dexgrasp.viewer import HandView, open_page
+    from dexgrasp.viewer import HandView, open_page, serve
 
     server = open_page(hand.name, port)
     HandView(server, hand)
-    print(f"http://{server.get_host()}:{server.get_port()}  (Ctrl-C ends)", flush=True)
-    try:
-        while True:
-            time.sleep(3600)
-    except KeyboardInterrupt:
-        server.stop()
+    serve(server)

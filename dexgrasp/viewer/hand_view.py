@@ -7,15 +7,15 @@ import numpy as np
 import torch
 import trimesh
 
-from dexgrasp.doctor.portrait import FROM, extent, link_colour
+from dexgrasp.doctor.portrait import FROM, extent
 from dexgrasp.execution import closing_direction
 from dexgrasp.hand import Hand
 from dexgrasp.simulation.hand_model import quaternion
+from dexgrasp.viewer.hand_figure import HandFigure, place
 
 if TYPE_CHECKING:
     from viser import ViserServer
 
-SOLID = (240, 150, 60)
 MARK = (20, 20, 20)
 
 
@@ -30,10 +30,8 @@ class HandView:
 
     def __init__(self, server: "ViserServer", hand: Hand, name: str = "hand") -> None:
         self.server, self.hand, self.name = server, hand, name
-        self.frames: dict[str, Any] = {}
-        self.solids: list[Any] = []
-        self.seen: list[Any] = []
-        self._add_meshes()
+        self.figure = HandFigure(server, hand, name, solid=True)
+        self.frames: dict[str, Any] = dict(self.figure.frames)
         self._add_marks()
         self._place_camera()
         self.sliders = self._add_sliders()
@@ -53,12 +51,10 @@ class HandView:
     def move(self) -> None:
         """Put every link where the sliders say."""
         joints = self.joints[None]
-        poses = {link: pose[0].numpy() for link, pose in self.hand.link_poses(joints).items()}
-        for finger, tip in zip(self.hand.fingers, self.hand.fingertips(joints)[0].numpy(), strict=True):
-            poses[f"tips/{finger.name}"] = tip
+        self.figure.move(joints[0])
         with self.server.atomic():
-            for place, frame in self.frames.items():
-                frame.position, frame.wxyz = poses[place][:3, 3], quaternion(poses[place][:3, :3])
+            for finger, tip in zip(self.hand.fingers, self.hand.fingertips(joints)[0].numpy(), strict=True):
+                place(self.frames[f"tips/{finger.name}"], tip)
 
     def closed_by(self, part: float) -> None:
         """Bring the closing joints to `part` (0 open, 1 closed) of their ranges."""
@@ -66,27 +62,6 @@ class HandView:
         low, high = self.hand.limits.T
         start, end = torch.where(direction < 0, high, low), torch.where(direction < 0, low, high)
         self.joints = torch.where(direction != 0, start + part * (end - start), self.joints)
-
-    def _add_meshes(self) -> None:
-        scene = self.server.scene
-        for link in self.hand.link_names:
-            place = f"/{self.name}/{link}"
-            self.frames[link] = scene.add_frame(place, show_axes=False)
-            if link in self.hand.visuals:
-                seen, shade = self.hand.visuals[link], link_colour(self.hand, link)
-                self.seen.append(
-                    scene.add_mesh_simple(
-                        f"{place}/visual", np.asarray(seen.vertices, np.float32), np.asarray(seen.faces),
-                        color=shade, flat_shading=True,
-                    )
-                )  # fmt: skip
-            for number, part in enumerate(self.hand.collisions.get(link, ())):
-                self.solids.append(
-                    scene.add_mesh_simple(
-                        f"{place}/collision_{number}", np.asarray(part.vertices, np.float32), np.asarray(part.faces),
-                        color=SOLID, opacity=0.5, flat_shading=True, visible=False,
-                    )
-                )  # fmt: skip
 
     def _place_camera(self) -> None:
         """Look at the whole hand, its approach upwards: the page's own camera stands metres away."""
@@ -103,14 +78,14 @@ class HandView:
             position=palm[:3, 3], wxyz=quaternion(palm[:3, :3]),
         )  # fmt: skip
         for finger in self.hand.fingers:
-            place = f"/{self.name}/tips/{finger.name}"
+            at = f"/{self.name}/tips/{finger.name}"
             self.frames[f"tips/{finger.name}"] = self.server.scene.add_frame(
-                place, axes_length=2 * finger.tip_radius, axes_radius=0.06 * finger.tip_radius
+                at, axes_length=2 * finger.tip_radius, axes_radius=0.06 * finger.tip_radius
             )
             ball = trimesh.creation.icosphere(2, 0.2 * finger.tip_radius)
             ball.apply_translation([0, -finger.tip_radius, 0])
             self.server.scene.add_mesh_simple(
-                f"{place}/contact", np.asarray(ball.vertices, np.float32), np.asarray(ball.faces), color=MARK
+                f"{at}/contact", np.asarray(ball.vertices, np.float32), np.asarray(ball.faces), color=MARK
             )
 
     def _add_sliders(self) -> list[Any]:
@@ -127,7 +102,10 @@ class HandView:
             closing = gui.add_slider("close all fingers", 0.0, 1.0, step=0.01, initial_value=0.0)
             closing.on_update(lambda event: self.closed_by(event.target.value))
         with gui.add_folder("show"):
-            for text, handles, on in (("visual meshes", self.seen, True), ("collision parts", self.solids, False)):
+            for text, handles, on in (
+                ("visual meshes", self.figure.seen, True),
+                ("collision parts", self.figure.solids, not self.figure.seen),
+            ):
                 box = gui.add_checkbox(text, initial_value=on)
                 box.on_update(partial(_show, handles))
         return sliders
