@@ -33,7 +33,7 @@ REALSENSE = "realsense"
 
 
 def main(config: DictConfig) -> None:
-    """Write grasps.yaml, grasps.npz, grasps.png and results.json; print the best grasps and the folder."""
+    """Write grasps.yaml, grasps.npz, cloud.npz, grasps.png and results.json; print the best grasps and the folder."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     given: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
     selection = read(Selection, config.selection, "selection")
@@ -50,6 +50,8 @@ def main(config: DictConfig) -> None:
     moved = predicted.grasps.moved(out_T_camera)
     arrays: dict[str, Any] = {name: value.numpy() for name, value in moved.tensors().items()}
     np.savez(folder / "grasps.npz", **arrays)
+    seen = sight.points @ motion[:3, :3].T + motion[:3, 3]
+    np.savez_compressed(folder / "cloud.npz", points=seen.astype(np.float32), object=sight.labels.astype(np.int16))
     flange_T_base = None if flange is None else torch.from_numpy(flange)
     table = None if sight.table_T_camera is None else (motion @ np.linalg.inv(sight.table_T_camera)).tolist()
     results = {
@@ -73,6 +75,10 @@ def main(config: DictConfig) -> None:
     print(table_of(moved, model.hand.joint_names))
     where = "no table found" if sight.table_T_camera is None else "table found"
     print(f"{where}, {sight.objects} objects, {len(moved)} grasps in {seconds:.2f} s, in the frame {frame!r}\n{folder}")
+    if given["view"]:
+        from dexgrasp.viewer import show
+
+        show(folder)
 
 
 def _model(given: dict[str, Any]) -> GraspNet:

@@ -18,18 +18,14 @@ def main(argv: list[str]) -> int:
 
     from dexgrasp.plugins import load_hand
     from dexgrasp.registry import names
-    from dexgrasp.viewer import Gallery, HandView, open_page, serve
-    from dexgrasp.viewer.sources import open_source
+    from dexgrasp.viewer import HandView, open_page, serve, show
 
-    if not Path(chosen.path).exists() and chosen.path in names("hand"):
+    if Path(chosen.path).exists() or chosen.path not in names("hand"):
+        places = chosen.scene, chosen.attempt, chosen.view
+        show(chosen.path, *places, most=chosen.top, port=chosen.port, host=chosen.host)
+    else:
         hand = load_hand(chosen.path)
         server = open_page(hand.name, chosen.port, chosen.host)
         HandView(server, hand)
-    else:
-        source = open_source(chosen.path, chosen.top, chosen.view)
-        first = source.position(chosen.scene, chosen.attempt)
-        source.make(first)  # what is wrong with it is told before a page is opened
-        server = open_page(Path(chosen.path).name, chosen.port, chosen.host)
-        Gallery(server, source.names, source.make, first)
-    serve(server)
+        serve(server)
     return 0

@@ -1,10 +1,13 @@
 """Several exhibits on one page: scenes of a dataset, attempts of an evaluation."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dexgrasp.viewer.exhibit import Exhibit
 from dexgrasp.viewer.grasp_view import GraspView
+from dexgrasp.viewer.page import PORT, open_page, serve
+from dexgrasp.viewer.sources import open_source
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -34,3 +37,21 @@ class Gallery:
         made = self.make(number)
         self.view.close()
         self.view = GraspView(self.server, made)
+
+
+def show(
+    path: str | Path,
+    scene: int = 0,
+    attempt: int = 1,
+    view: int = 0,
+    most: int = 30,
+    port: int = PORT,
+    host: str = "127.0.0.1",
+) -> None:
+    """Show what lies in a folder (see `open_source`) until Ctrl-C."""
+    source = open_source(path, most, view)
+    first = source.position(scene, attempt)
+    source.make(first)  # what is wrong with it is told before a page is opened
+    server = open_page(Path(path).absolute().name, port, host)
+    Gallery(server, source.names, source.make, first)
+    serve(server)
