@@ -1,7 +1,7 @@
 """An evaluation in full: every held-out scene cleared, beside the ceilings that its labels set."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -90,14 +90,27 @@ class Campaign:
             results["ceilings"] = _ceiling_rates([verdicts for _, verdicts in done], self.seed)
         return episodes, results
 
-    def look(self, scene: int, objects: list[Object], poses: Float[Tensor, "O 4 4"], seed: int) -> View:
+    def look(self, scene: int, objects: Sequence[Object], poses: Float[Tensor, "O 4 4"], seed: int) -> View:
         """Return what the scene's fixed cameras see, with fresh noise."""
+        framing = read(Framing, self.dataset.config["views"]["framing"], "dataset.views.framing")
+        seen, cameras, sensor = self._set_up(scene, objects, poses)
+        return capture(seen, cameras, sensor, framing, stream(seed, "sensor"))
+
+    def depth(
+        self, scene: int, objects: Sequence[Object], poses: Float[Tensor, "O 4 4"], seed: int
+    ) -> Float[np.ndarray, "H W"]:
+        """Return the depth image (m; 0 for a hole) that the first camera measures in `look`."""
+        seen, cameras, sensor = self._set_up(scene, objects, poses)
+        return sensor.measure(seen.render(sensor.camera, cameras[0]), stream(seed, "sensor")).depth
+
+    def _set_up(
+        self, scene: int, objects: Sequence[Object], poses: Float[Tensor, "O 4 4"]
+    ) -> tuple[MeshScene, list[Float[Tensor, "4 4"]], Sensor]:
         config, generator = self.dataset.config, stream(self.seed, "viewpoint", scene)
         viewpoints = read(Viewpoints, config["views"]["viewpoints"], "dataset.views.viewpoints")
         cameras = [viewpoints.draw(generator) for _ in range(config["views"].get("fused", 1))]
-        framing = read(Framing, config["views"]["framing"], "dataset.views.framing")
         seen = MeshScene([item.mesh for item in objects], poses, self.dataset.scene(scene).fixtures)
-        return capture(seen, cameras, Sensor.build(config["camera"]), framing, stream(seed, "sensor"))
+        return seen, cameras, Sensor.build(config["camera"])
 
     def predict(self, situation: Situation) -> Grasps:
         """Return the grasps that network or planner offer and that are worth trying, camera frame."""

@@ -58,7 +58,7 @@ class Episode:
     removed: tuple[str, ...]
     attempts: tuple[Attempt, ...]
     strips: tuple[dict[str, Any], ...] = field(default=(), repr=False)
-    """What a report needs to draw each attempt: poses, grasp, view."""
+    """What a report needs to draw each attempt: poses, the grasp and those offered beside it, view and its seed."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,8 @@ def clear(
             )
         )
         if draw:
-            strips.append({"names": names, "poses": poses.clone(), "grasp": chosen, "view": view})
+            told = {"names": names, "poses": poses.clone(), "grasp": chosen, "offered": offered}
+            strips.append(told | {"view": view, "seed": drawn})
         after = outcome.final[0].to(poses)
         if success:
             removed.append(names[row])

@@ -31,6 +31,8 @@ class Strip:
     """world_T_object, m; NaN: gone."""
     grasp: Grasps
     """World frame."""
+    offered: Grasps
+    """All that were there to choose from, best first, world frame."""
     points: Float[Tensor, "P 3"]
     """What the camera saw, world frame, m, rounded to 0.1 mm."""
     instance: Int[Tensor, "P"]
@@ -46,12 +48,13 @@ def write_replay(folder: Path, episodes: Sequence[Episode], dataset: Dataset) ->
         for attempt, strip in zip(drawn, episode.strips, strict=False):
             key, view = f"{episode.scene}/{attempt.number}", strip["view"]
             tensors[f"{key}/poses"] = strip["poses"].double()
-            tensors |= {f"{key}/grasp/{name}": value for name, value in strip["grasp"].tensors().items()}
-            tensors[f"{key}/points"] = transform(view.world_T_camera, view.points).half()
+            for kind in ("grasp", "offered"):
+                tensors |= {f"{key}/{kind}/{name}": value for name, value in strip[kind].tensors().items()}
+            tensors[f"{key}/points"] = transform(view.world_T_camera.expand(len(view), 4, 4), view.points).half()
             tensors[f"{key}/instance"] = view.instance.to(torch.int16)
             tensors[f"{key}/world_T_camera"] = view.world_T_camera
     path = folder / FILE
-    replace_file(path, save({name: value.contiguous() for name, value in tensors.items()}))
+    replace_file(path, save({name: value.clone().contiguous() for name, value in tensors.items()}))
     dataset.save(folder / DATASET)
     return path
 
@@ -72,6 +75,10 @@ def read_replay(folder: Path) -> list[Strip]:
 
 def _strip(scene: int, number: int, tensors: dict[str, Tensor]) -> Strip:
     key = f"{scene}/{number}"
-    grasp = Grasps(**{each.name: tensors[f"{key}/grasp/{each.name}"] for each in fields(Grasps)})
+    grasp, offered = (
+        Grasps(**{each.name: tensors[f"{key}/{kind}/{each.name}"] for each in fields(Grasps)})
+        for kind in ("grasp", "offered")
+    )
     points, instance = tensors[f"{key}/points"].float(), tensors[f"{key}/instance"].long()
-    return Strip(scene, number, tensors[f"{key}/poses"], grasp, points, instance, tensors[f"{key}/world_T_camera"])
+    poses, camera = tensors[f"{key}/poses"], tensors[f"{key}/world_T_camera"]
+    return Strip(scene, number, poses, grasp, offered, points, instance, camera)

@@ -18,6 +18,7 @@ from dexgrasp.dataset.pipeline import ensure
 from dexgrasp.errors import DexgraspError
 from dexgrasp.evaluation import Policy
 from dexgrasp.fingerprint import scenes_hash
+from dexgrasp.overview import draw_look
 from dexgrasp.plugins import build_hand, build_planner
 from dexgrasp.replay import write_replay
 from dexgrasp.report import draw_attempts, rows, write_report, write_results
@@ -118,7 +119,8 @@ def evaluate(config: DictConfig, hand: Mapping[str, Any], checkpoint: Path | Non
     folder.mkdir(parents=True, exist_ok=True)
     write_results(folder, "evaluation", results)
     write_replay(folder, episodes, dataset)
-    write_report(folder, results, draw_attempts(folder, episodes, dataset.objects, dataset.hand))
+    images = [*draw_look(folder, campaign, episodes), *draw_attempts(folder, episodes, dataset.objects, dataset.hand)]
+    write_report(folder, results, images)
     return results
 
 

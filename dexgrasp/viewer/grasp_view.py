@@ -66,6 +66,10 @@ class GraspView:
         if len(self.exhibit.grasps) == 0:
             self.hand.base.visible = False
             return
+        with self._turn:
+            self._choose(number)
+
+    def _choose(self, number: int) -> None:
         self._run += 1
         self.chosen, self.motion = number, None
         grasp = self.exhibit.grasps[number]

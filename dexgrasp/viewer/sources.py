@@ -102,7 +102,7 @@ def scene(dataset: Dataset, index: int, most: int = 30, view: int = 0) -> Exhibi
             raise DexgraspError("a view of the scene", found, "give another by --view")
         seen = dataset.view(number)
         camera = seen.world_T_camera.double().numpy()
-        points = transform(torch.from_numpy(camera), seen.points.double()).numpy()
+        points = transform(torch.from_numpy(camera).expand(len(seen), 4, 4), seen.points.double()).numpy()
         colours = {"objects": _by_object(seen.instance)}
         if "labels" in dataset.folders:
             colours["graspable points"] = _graspable(dataset, number, len(points))
@@ -180,12 +180,16 @@ def evaluation(folder: Path, results: dict[str, Any]) -> Source:
 
 
 def attempt(dataset: Dataset, strip: Strip, row: dict[str, Any], results: dict[str, Any]) -> Exhibit:
-    """Return one attempt of an evaluation; `simulate` carries it out once more."""
+    """Return one attempt of an evaluation: the grasp that was executed, then the others that were offered.
+
+    `simulate` carries any of them out once more.
+    """
     shown = dataset.scene(strip.scene)
     items = [dataset.objects[name] for name in shown.objects]
-    poses, grasp = strip.poses.double(), strip.grasp.to(torch.float64)
+    poses, grasp, offered = strip.poses.double(), strip.grasp.to(torch.float64), strip.offered.to(torch.float64)
     target = -1 if row["target"] is None else list(shown.objects).index(row["target"])
-    grasp = grasp.replace(object=torch.full((len(grasp),), target))
+    others = ~(offered.pose == grasp.pose).flatten(1).all(dim=1)
+    grasps = Grasps.cat([grasp.replace(object=torch.full((1,), target)), offered[others]])
     protocol = load_protocol(results["protocol_values"])
     epsilon = "" if row["epsilon"] is None else f", epsilon when closed {row['epsilon']:.3f}"
     ended = row["reason"].replace("_", " ") + (f": {row['lifted']}" if row["lifted"] else "")
@@ -194,15 +198,19 @@ def attempt(dataset: Dataset, strip: Strip, row: dict[str, Any], results: dict[s
         title=f"scene {strip.scene}, attempt {strip.number + 1}",
         hand=dataset.hand,
         bodies=tuple(Body(item.name, item.mesh, pose.numpy()) for item, pose in zip(items, poses, strict=True)),
-        grasps=grasp,
-        notes=(f"{note}\n\n{_told(dataset.hand, grasp)}",),
+        grasps=grasps,
+        notes=tuple(
+            (f"{note}\n\n" if i == 0 else f"offered, not executed: score **{float(grasps.quality[i]):.2f}**\n\n")
+            + _told(dataset.hand, grasps[i])
+            for i in range(len(grasps))
+        ),
         points=strip.points.double().numpy(),
         colours={"objects": _by_object(strip.instance)},
         fixtures=shown.fixtures,
         friction=protocol.physics.friction,
         camera=strip.world_T_camera.double().numpy(),
         floor=np.eye(4),
-        simulate=partial(_simulate, items, poses, dataset.hand, grasp, protocol, shown.fixtures),
+        simulate=partial(_simulate, items, poses, dataset.hand, grasps, protocol, shown.fixtures),
     )
 
 
