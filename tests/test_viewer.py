@@ -23,7 +23,7 @@ from dexgrasp.scene import View
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import load_protocol
 from dexgrasp.viewer.exhibit import LIFT, Body, Exhibit, planned
-from dexgrasp.viewer.marks import contacts, friction_cone, shades, skeleton
+from dexgrasp.viewer.marks import CONE, contacts, friction_cone, shades, skeleton
 
 FLAGS = """--headless=new --no-sandbox --disable-dev-shm-usage --use-gl=angle --use-angle=swiftshader
 --enable-unsafe-swiftshader --ignore-gpu-blocklist --remote-debugging-port=0 --window-size=700,400 --no-first-run"""
@@ -71,7 +71,7 @@ def test_friction_cones_hold_the_forces_that_friction_bears(exhibit):
     away = cone.vertices - points[0]
     tip = np.linalg.norm(away, axis=1).argmin()
     assert np.allclose(away[tip], 0, atol=1e-9) and cone.is_volume
-    rim = away[np.linalg.norm(away, axis=1) > 0.031]
+    rim = away[np.linalg.norm(away, axis=1) > 1.01 * CONE]
     angles = np.arccos(rim @ normals[0] / np.linalg.norm(rim, axis=1))
     assert len(rim) >= 12 and np.allclose(angles, math.atan(0.5), atol=1e-6)
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 ROOT = "stage"
 PALETTE = ((219, 115, 89), (102, 158, 204), (140, 189, 112), (217, 179, 89), (158, 133, 194))
-BESIDE, AWAY = 1.0, 0.45
+BESIDE, AWAY = 1.0, 0.5
 """How far to the side of the camera's place a scene is looked at from, rad; and from how far away, m."""
 POINT = 0.0022
 """Size of a point of a cloud, m."""
@@ -82,7 +82,7 @@ class GraspView:
             ball = trimesh.creation.icosphere(2, 0.003).apply_translation(point)
             self.marks.append(self._mesh(f"marks/contact_{index}", ball, (20, 20, 20)))
             cone = friction_cone(point, normal, self.exhibit.friction)
-            self.marks.append(self._mesh(f"marks/cone_{index}", cone, (230, 60, 60), opacity=0.45))
+            self.marks.append(self._mesh(f"marks/cone_{index}", cone, (190, 50, 190), opacity=0.5))
         self._show_marks()
         self.text.content = f"**grasp {number + 1} of {len(self.exhibit.grasps)}**\n\n{self.exhibit.notes[number]}"
         if self.slider.value != number + 1:
@@ -94,7 +94,7 @@ class GraspView:
         with self.server.atomic():
             self.hand.move(as_joints(motion.joints[picture]), motion.base[picture])
             self._stand(motion.bodies[picture])
-        for mark in self.marks:
+        for mark in (*self.marks, *self.markers):
             mark.visible = False
         self.phase.value = motion.phases[picture]
 
@@ -217,14 +217,15 @@ class GraspView:
             if len(exhibit.colours) > 1:
                 colours = gui.add_dropdown("cloud shows", tuple(exhibit.colours))
                 colours.on_update(lambda event: setattr(self.cloud, "colors", exhibit.colours[event.target.value]))
-            self.boxes = {
-                "all grasps": (self.markers, True),
+            shown: dict[str, tuple[list[Any] | None, bool]] = {
+                "all grasps": (None, True),
                 "contacts, friction cones": (None, True),
+                "hand": ([self.hand.base], True),
                 "objects": (self.bodies, True),
                 "cloud": ([] if self.cloud is None else [self.cloud], self.cloud is not None and self.cloud.visible),
             }
             self.ticks = {}
-            for text, (handles, on) in self.boxes.items():
+            for text, (handles, on) in shown.items():
                 self.ticks[text] = box = gui.add_checkbox(text, on)
                 box.on_update(partial(_show, handles) if handles is not None else lambda _: self._show_marks())
 
@@ -256,8 +257,11 @@ class GraspView:
                 place(frame, pose)
 
     def _show_marks(self) -> None:
+        """Show what is ticked: no skeleton where the hand itself is."""
         for mark in self.marks:
             mark.visible = self.ticks["contacts, friction cones"].value
+        for number, marker in enumerate(self.markers):
+            marker.visible = self.ticks["all grasps"].value and number != self.chosen
 
 
 def _show(handles: list[Any], event: Any) -> None:

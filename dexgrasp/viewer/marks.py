@@ -14,8 +14,8 @@ LOW, MIDDLE, HIGH = (205, 60, 50), (235, 190, 60), (50, 160, 75)
 """Colours of a low, middle and high score."""
 THICK = 0.0015
 """Radius of a skeleton's bones, m."""
-CONE = 0.03
-"""Height of a friction cone, m."""
+CONE = 0.05
+"""Height of a friction cone, m: more than a fingertip is thick."""
 
 
 def shades(values: Float[np.ndarray, "N"]) -> UInt8[np.ndarray, "N 3"]:
