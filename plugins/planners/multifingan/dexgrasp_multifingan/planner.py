@@ -49,7 +49,7 @@ class MultiFinGan(Planner):
         *,
         types: int = 7,
         samples: int = 110,
-        points: int = 192,
+        points: int = 128,
         channels: int = 128,
         hidden: int = 256,
         views: int = 1200,
@@ -70,7 +70,9 @@ class MultiFinGan(Planner):
         """Take over what a fit has written."""
         tensors, notes = read_tensors(path)
         if notes.get("kind") != KIND:
-            raise DexgraspError("weights of the planner multifingan", f"{path} of something else", "give a fit's folder")
+            raise DexgraspError(
+                "weights of the planner multifingan", f"{path} of something else", "give a fit's folder"
+            )
         check_hand(self.hand, notes["hand"], path)
         self.sizes, self.points = notes["sizes"], notes["points"]
         networks = Networks(self.hand, **self.sizes)
@@ -109,7 +111,9 @@ class MultiFinGan(Planner):
         found = [told(row, level[view.instance == row]) for row in seen]
         if not found:
             nothing = torch.zeros(0, 4, 4, dtype=torch.float64)
-            return Grasps.build(nothing, nothing[:, 0, :1].expand(0, len(self.hand.joint_names)), len(self.hand.fingers))
+            return Grasps.build(
+                nothing, nothing[:, 0, :1].expand(0, len(self.hand.joint_names)), len(self.hand.fingers)
+            )
         grasps = Grasps.cat(found).moved(inverse(level_T_camera))
         return select(self.hand, grasps, cloud, top_k, Selection(min_score=-math.inf), table_T_camera)
 
