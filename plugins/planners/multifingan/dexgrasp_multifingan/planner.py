@@ -79,6 +79,12 @@ class MultiFinGan(Planner):
         load_state(networks, tensors, path)
         self.networks = networks.eval()
 
+    def save(self, folder: Path) -> None:
+        """Write what is learnt, with the hand's check, whole or not at all."""
+        assert self.networks is not None
+        notes = {"kind": KIND, "hand": kinematics(self.hand), "sizes": self.sizes, "points": self.points}
+        write_tensors(Path(folder) / FILE, self.networks.state_dict(), notes)
+
     def fit(self, dataset: Dataset, seed: int, folder: Path) -> dict[str, Any]:
         """Train on the objects of split "train" as seen, and their feasible grasps; write weights into `folder`."""
         check_hand(self.hand, kinematics(dataset.hand), Path("the dataset"))
@@ -88,8 +94,7 @@ class MultiFinGan(Planner):
             networks = Networks(self.hand, **self.sizes)
         losses = Fitting(networks, found, dataset.field, self.settings, seed).run()
         self.networks = networks.eval()
-        notes = {"kind": KIND, "hand": kinematics(self.hand), "sizes": self.sizes, "points": self.points}
-        write_tensors(Path(folder) / FILE, networks.state_dict(), notes)
+        self.save(folder)
         count = sum(value.numel() for value in networks.parameters())
         grasps = sum(len(example.base) for example in found)
         return {"examples": len(found), "grasps": grasps, "parameters": count, "losses": losses}
