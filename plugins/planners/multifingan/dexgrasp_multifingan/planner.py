@@ -115,10 +115,8 @@ class MultiFinGan(Planner):
         told = partial(self._of_object, self.networks, situation.seed)
         found = [told(row, level[view.instance == row]) for row in seen]
         if not found:
-            nothing = torch.zeros(0, 4, 4, dtype=torch.float64)
-            return Grasps.build(
-                nothing, nothing[:, 0, :1].expand(0, len(self.hand.joint_names)), len(self.hand.fingers)
-            )
+            pose, joints = torch.zeros(0, 4, 4), torch.zeros(0, len(self.hand.joint_names))
+            return Grasps.build(pose.double(), joints.double(), len(self.hand.fingers))
         grasps = Grasps.cat(found).moved(inverse(level_T_camera))
         return select(self.hand, grasps, cloud, top_k, Selection(min_score=-math.inf), table_T_camera)
 
