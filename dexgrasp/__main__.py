@@ -15,6 +15,7 @@ PIPELINES = {
     "train": "train a network, evaluate it in physics, show the result",
     "eval": "a trained network in physics: model=RUN; or a set of grasps under several protocols: grasps=FILE",
     "predict": "grasps for one point cloud or depth image",
+    "export": "a trained network as ONNX or torch.export, checked; or as weights of the package: model=RUN [ship=NAME]",
     "fidelity": "how much of a grasp each representation keeps",
 }
 """Hydra apps: ``key=value`` overrides; config ``conf/<command>.yaml``."""
