@@ -132,5 +132,13 @@ class MultiFinGan(Planner):
         score = networks.judge(judged, networks.judged(palm, joints))
         base = networks.base(palm).double()
         base[:, :3, 3] += middle
-        fingers, touching = len(self.hand.fingers), networks.types_touching[kind]
-        return Grasps.build(base, joints.double(), fingers, quality=score.double(), touching=touching)
+        touching, every = networks.types_touching[kind], torch.arange(self.samples)
+        grasps = Grasps.build(base, joints.double(), len(self.hand.fingers), quality=score.double(), touching=touching)
+        # One contact is told, so that reports know the object: the seen point that is nearest to a touching fingertip.
+        tips = (base.unsqueeze(1) @ self.hand.fingertips(grasps.joints))[..., :3, 3]
+        away, nearest = torch.cdist(tips, cloud[:, :3].double()).min(-1)
+        finger = torch.where(touching, away, math.inf).argmin(1)
+        grasps.contacts[every, finger], grasps.normals[every, finger] = (
+            part[nearest[every, finger]] for part in cloud.double().split(3, dim=1)
+        )
+        return grasps.replace(finger=finger)
