@@ -148,3 +148,11 @@ def test_grasps_move_with_the_scene(planner):
     after = planner[0].plan(replace(seen, view=view), 5)
     assert len(before) == len(after) > 0
     torch.testing.assert_close(after.pose[:, :3, 3], before.pose[:, :3, 3] + slide, atol=2e-3, rtol=0)
+
+
+def test_each_grasp_tells_the_object_it_is_meant_for(planner):
+    view = two_boxes().view
+    grasps = planner[0].plan(two_boxes(), 5)
+    told = grasps.contacts[torch.arange(len(grasps)), grasps.finger]
+    nearest = torch.cdist(told, view.points.double()).min(1)
+    assert (nearest.values < 1e-5).all() and (view.instance[nearest.indices] >= 0).all()
