@@ -16,13 +16,36 @@ CERTAIN = 100.0
 """Logit of the true class in `as_prediction`: its probability is 1 in float32."""
 
 
+class Layers(nn.Sequential):
+    """Layers in a row. In evaluation, a linear layer and the batch norm behind it are one multiplication."""
+
+    def forward(self, rows: Float[Tensor, "N C"]) -> Float[Tensor, "N D"]:
+        if self.training:
+            return super().forward(rows)  # type: ignore[no-any-return]
+        layers = list(self)
+        for layer, following in zip(layers, [*layers[1:], None], strict=False):
+            if isinstance(layer, nn.Linear):
+                weight, bias = layer.weight, layer.bias
+                if isinstance(following, nn.BatchNorm1d):
+                    scale = following.weight * (following.running_var + following.eps).rsqrt()
+                    weight = weight * scale.unsqueeze(1)
+                    shift = following.running_mean if bias is None else following.running_mean - bias
+                    bias = following.bias - shift * scale
+                rows = F.linear(rows, weight, bias)
+            elif isinstance(layer, nn.ReLU):
+                rows = F.relu_(rows)  # behind a linear layer: its own memory
+            elif not isinstance(layer, nn.BatchNorm1d):
+                rows = layer(rows)
+        return rows
+
+
 def mlp(channels: int, hidden: Sequence[int], out: int) -> nn.Sequential:
     """Return linear, batch norm, ReLU per hidden layer and a linear layer on top (no bias under a batch norm)."""
     layers: list[nn.Module] = []
     for width in hidden:
         layers += [nn.Linear(channels, width, bias=False), nn.BatchNorm1d(width), nn.ReLU()]
         channels = width
-    return nn.Sequential(*layers, nn.Linear(channels, out))
+    return Layers(*layers, nn.Linear(channels, out))
 
 
 class Heads(nn.Module):
