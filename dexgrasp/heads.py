@@ -25,18 +25,23 @@ class Layers(nn.Sequential):
         layers = list(self)
         for layer, following in zip(layers, [*layers[1:], None], strict=False):
             if isinstance(layer, nn.Linear):
-                weight, bias = layer.weight, layer.bias
-                if isinstance(following, nn.BatchNorm1d):
-                    scale = following.weight * (following.running_var + following.eps).rsqrt()
-                    weight = weight * scale.unsqueeze(1)
-                    shift = following.running_mean if bias is None else following.running_mean - bias
-                    bias = following.bias - shift * scale
-                rows = F.linear(rows, weight, bias)
+                folded = (
+                    _folded(layer, following) if isinstance(following, nn.BatchNorm1d) else (layer.weight, layer.bias)
+                )
+                rows = F.linear(rows, *folded)
             elif isinstance(layer, nn.ReLU):
                 rows = F.relu_(rows)  # behind a linear layer: its own memory
             elif not isinstance(layer, nn.BatchNorm1d):
                 rows = layer(rows)
         return rows
+
+
+def _folded(layer: nn.Linear, norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
+    """Return weight and bias of a linear layer and the batch norm behind it, with its running statistics."""
+    assert norm.running_mean is not None and norm.running_var is not None
+    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+    shift = norm.running_mean if layer.bias is None else norm.running_mean - layer.bias
+    return layer.weight * scale.unsqueeze(1), norm.bias - shift * scale
 
 
 def mlp(channels: int, hidden: Sequence[int], out: int) -> nn.Sequential:

@@ -108,13 +108,13 @@ def _compiled(
     middle: Float[Tensor, "N 3"], palm: Float[Tensor, "N 4 4"], points: Float[Tensor, "Q 6"], count: int
 ) -> Float[Tensor, "N K 7"]:
     out = torch.empty(len(middle), count, 7)
-    arrays = [part.detach().contiguous().numpy() for part in (middle, palm, points)]
-    _around(*arrays, np.float32(1 / REACH), out.numpy())
+    one, other, third = (part.detach().contiguous().numpy() for part in (middle, palm, points))
+    _around(one, other, third, np.float32(1 / REACH), out.numpy())
     return out
 
 
 @njit(cache=True)
-def _around(middle: np.ndarray, palm: np.ndarray, points: np.ndarray, scale: float, out: np.ndarray) -> None:
+def _around(middle: np.ndarray, palm: np.ndarray, points: np.ndarray, scale: np.float32, out: np.ndarray) -> None:
     count, total = out.shape[1], len(points)
     x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
     apart = np.empty(total, np.float32)
