@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from dexgrasp.hand import Hand, tip_frame
+from dexgrasp.hand import tip_frame
 from dexgrasp.hand_body import HandBody, hand_body
 from dexgrasp.urdf import UrdfHand
 
