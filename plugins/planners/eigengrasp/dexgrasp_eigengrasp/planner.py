@@ -74,7 +74,7 @@ class EigenGrasp(Planner):
         steps: int = 4000,
         best: int = 20,
         energy: str = "guided",
-        contacts: Sequence[str] = (PALM, LINKS, TIPS),
+        contacts: Sequence[str] = (TIPS,),
         synergy: str | None = None,
         friction: float = 0.5,
         edges: int = 8,
@@ -185,11 +185,10 @@ class EigenGrasp(Planner):
     def _close(
         self, field: DistanceField, bases: np.ndarray, joints: np.ndarray
     ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
-        """Auto-grasp; return bases and joints, contacts (N, F, 6) and depth (N,). Fingers that miss stay as they were."""
+        """Auto-grasp; return bases and joints, contacts (N, F, 6), depth (N,). Fingers that miss stay as they were."""
         everything = self.closing.close(field.field, bases, joints)
         touching = np.isfinite(everything[3][..., 0])
-        again = self.closing.close(field.field, bases, joints, touching=touching)
-        placed, _, full, touches, _, depth = again
+        placed, _, full, touches, _, depth = self.closing.close(field.field, bases, joints, touching=touching)
         return (placed, np.ascontiguousarray(full[:, self.body.leaders])), touches, depth
 
 
