@@ -19,7 +19,7 @@ from dexgrasp.sensing.limits import GRASPS, sized
 KINDS = "biufcSU?"
 """Kinds of numbers and texts of which arrays may be."""
 DEEPEST = 50
-MOST = 5_000_000
+MOST = 1_000_000
 """Values of one pickle, each counted as often as it stands in another: a small one can stand for endlessly many."""
 WIDEST = 4096
 """Bytes, or letters, of one value of an array."""
