@@ -13,8 +13,11 @@ from dexgrasp.errors import DexgraspError, room
 PIPELINES = {
     "dataset": "objects -> grasps -> scenes -> views -> labels; dataset estimate|inspect|verify|merge|export|card",
     "train": "train a network, evaluate it in physics, show the result",
-    "eval": "a trained network in physics: model=RUN; or a set of grasps under several protocols: grasps=FILE",
+    "eval": "a network (model=RUN) or planner (planner=NAME) in physics; grasps=FILE: a set under several protocols",
+    "fit": "teach a planner (a baseline that learns) on a dataset",
+    "study": "compare methods under several rules, in tables: experiment=quick_benchmark",
     "predict": "grasps for one point cloud or depth image",
+    "export": "a trained network as ONNX or torch.export, checked; or as weights of the package: model=RUN [ship=NAME]",
     "fidelity": "how much of a grasp each representation keeps",
 }
 """Hydra apps: ``key=value`` overrides; config ``conf/<command>.yaml``."""

@@ -1,34 +1,45 @@
 """An evaluation in full: every held-out scene cleared, beside the ceilings that its labels set."""
 
+import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import joblib
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dexgrasp.ceilings import ceilings
 from dexgrasp.child import end_with_parent
 from dexgrasp.dataset.camera import MeshScene, Viewpoints
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.framing import Framing
 from dexgrasp.dataset.sensor import Sensor, capture
-from dexgrasp.evaluation import Episode, Policy, attempt_rows, ceilings, clear, rate, summarise
+from dexgrasp.evaluation import Episode, Policy, attempt_rows, clear, episode_rows, rate, summarise
 from dexgrasp.execution import opened
 from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
+from dexgrasp.hand import Hand
 from dexgrasp.model import GraspNet, load_model
 from dexgrasp.objects import Object
+from dexgrasp.planner import Planner, Situation
+from dexgrasp.plugins import build_planner
+from dexgrasp.prediction import predict_sight
 from dexgrasp.progress import track
 from dexgrasp.scene import View
 from dexgrasp.seeds import stream
+from dexgrasp.segmentation import clusters
 from dexgrasp.selection import Selection
 from dexgrasp.settings import read
+from dexgrasp.sight import Sight
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.statistics import rate_interval
+from dexgrasp.table import find_tabletop
 from dexgrasp.wrench_model import WrenchModel
 
 
@@ -39,11 +50,18 @@ class Campaign:
     dataset: Dataset
     """Held-out objects with their grasps and scenes."""
     protocol: Protocol
-    model: Path
+    model: Path | None
+    """Checkpoint of the network; None: `planner` grasps."""
     policy: Policy
     selection: Selection
     top_k: int
     seed: int
+    planner: Mapping[str, Any] | None = None
+    """Resolved config of the group `planner`."""
+    segmented: bool = False
+    """Whether a network's grasps are those of `predict`: of objects segmented by geometry, closed on what was seen."""
+    oracle: int = 0
+    """Labels of each object that the oracle may try, see `ceilings`."""
     drawn: int = 8
     """Scenes whose attempts are kept for pictures."""
 
@@ -65,6 +83,7 @@ class Campaign:
             "top_k": self.top_k,
             "seed": self.seed,
             "summary": summarise(episodes, self.seed),
+            "episodes": episode_rows(episodes),
             "attempts": attempt_rows(episodes),
         }
         if label_ceilings:
@@ -80,11 +99,23 @@ class Campaign:
         seen = MeshScene([item.mesh for item in objects], poses, self.dataset.scene(scene).fixtures)
         return capture(seen, cameras, Sensor.build(config["camera"]), framing, stream(seed, "sensor"))
 
-    def predict(self, view: View) -> Grasps:
-        """Return the grasps that the network offers and that are worth trying, camera frame."""
-        network = _network(self.model, self.model.stat().st_mtime_ns)
-        grasps = network.predict(view.points, view.normals, self.top_k, self.selection, self.seed)
+    def predict(self, situation: Situation) -> Grasps:
+        """Return the grasps that network or planner offer and that are worth trying, camera frame."""
+        if self.model is None:
+            return self._planner().plan(situation, self.top_k)
+        view, network = situation.view, _network(self.model, self.model.stat().st_mtime_ns)
+        if self.segmented:
+            seen = sight(view, self.seed)
+            if seen.objects == 0:
+                return Grasps.none(len(self.dataset.hand.joint_names), len(self.dataset.hand.fingers))
+            grasps = predict_sight(network, seen, self.top_k, self.selection, seed=self.seed).grasps
+        else:
+            grasps = network.predict(view.points, view.normals, self.top_k, self.selection, self.seed)
         return grasps if network.scorer is None else grasps[grasps.quality >= self.policy.min_lift]
+
+    def _planner(self) -> Planner:
+        assert self.planner is not None
+        return _planner(json.dumps(dict(self.planner), sort_keys=True), self.dataset.hand)
 
     def reached(self, item: Object, pose: Float[Tensor, "4 4"], grasp: Grasps) -> float:
         """Return epsilon of the contacts in which the fingers end on the true mesh, torque about its centre of mass."""
@@ -107,12 +138,10 @@ def _work(campaign: Campaign, index: int, label_ceilings: bool) -> tuple[Episode
         simulator = MujocoSimulator(dataset.config["simulator"]["settling"])
         objects = [dataset.objects[name] for name in dataset.scene(index).objects]
         poses, fixtures = dataset.scene(index).poses.double(), dataset.scene(index).fixtures
-        common = (dataset.hand, simulator, campaign.protocol)
-        verdicts = (
-            ceilings(index, objects, poses, dataset.scene_grasps(index), *common, campaign.seed, fixtures)
-            if label_ceilings
-            else {}
-        )
+        verdicts: dict[str, list[bool]] = {}
+        if label_ceilings:
+            labels, rules = dataset.scene_grasps(index), (dataset.hand, simulator, campaign.protocol, campaign.seed)
+            verdicts = ceilings(index, objects, poses, labels, *rules, fixtures, campaign.oracle)
         episode = clear(
             index,
             objects,
@@ -133,10 +162,23 @@ def _work(campaign: Campaign, index: int, label_ceilings: bool) -> tuple[Episode
         torch.set_num_threads(threads)
 
 
+def sight(view: View, seed: int) -> Sight:
+    """Return a view with its table and its objects by geometry alone."""
+    points, normals = view.points.double().numpy(), view.normals.double().numpy()
+    table = find_tabletop(torch.from_numpy(np.hstack([points, normals])), seed)
+    known = None if table is None else table.numpy()
+    return Sight(points, normals, clusters(points, known), known, np.eye(4))
+
+
 @lru_cache(1)
 def _network(path: Path, stamp: int) -> GraspNet:
     """`stamp` tells a file from an older one of that name."""
     return load_model(path)
+
+
+@lru_cache(1)
+def _planner(config: str, hand: Hand) -> Planner:
+    return build_planner(json.loads(config), hand)
 
 
 def _ceiling_rates(verdicts: list[dict[str, list[bool]]], seed: int) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from dexgrasp.geometry import inverse, rotation_angle
 from dexgrasp.grasps import Grasps, Reason
 from dexgrasp.hand import Hand
 from dexgrasp.objects import Object
+from dexgrasp.planner import Situation
 from dexgrasp.scene import Boxes, View
 from dexgrasp.seeds import stream
 from dexgrasp.simulation.protocol import Protocol
@@ -25,7 +26,7 @@ from dexgrasp.statistics import bootstrap_ratio, rate_interval
 
 Look = Callable[[Sequence[Object], Float[Tensor, "O 4 4"], int], View]
 """Renders the objects at their poses; the last argument seeds camera and noise."""
-Predict = Callable[[View], Grasps]
+Predict = Callable[[Situation], Grasps]
 """Returns grasps in the camera frame, best first."""
 Epsilon = Callable[[Object, Float[Tensor, "4 4"], Grasps], float]
 """Returns the epsilon quality that one grasp (world frame) reaches on an object at a pose."""
@@ -102,9 +103,11 @@ def clear(
     budget = math.floor(policy.attempts_per_object * len(objects))
     while len(attempts) < budget and len(standing := present(poses)) > protocol.verdict.stop_at:
         began = time.perf_counter()
-        view = look([objects[i] for i in standing], poses[standing], _seed(seed, "look", index, len(attempts)))
+        there, drawn = tuple(objects[i] for i in standing), _seed(seed, "look", index, len(attempts))
+        view = look(there, poses[standing], drawn)
         looked = time.perf_counter()
-        offered = predict(view).moved(view.world_T_camera)
+        situation = Situation(view, there, poses[standing].double(), fixtures, drawn)
+        offered = predict(situation).moved(view.world_T_camera)
         chosen = choose(offered[~tilted(hand, offered, protocol.verdict.max_tilt)], failed, policy)
         predicted = time.perf_counter()
         seconds = {"render": looked - began, "predict": predicted - looked}
@@ -156,38 +159,6 @@ def choose(offered: Grasps, failed: Sequence[Grasps], policy: Policy) -> Grasps 
     return offered[int(fresh.nonzero()[0, 0])] if fresh.any() else None
 
 
-def ceilings(
-    index: int,
-    objects: Sequence[Object],
-    poses: Float[Tensor, "O 4 4"],
-    labels: Grasps,
-    hand: Hand,
-    simulator: Simulator,
-    protocol: Protocol,
-    seed: int,
-    fixtures: Boxes | None = None,
-) -> dict[str, list[bool]]:
-    """Execute, for each object of the untouched scene, its best label by epsilon and a random one.
-
-    `labels` are the feasible grasps of the scene (world frame); an object without any is not counted.
-    """
-    chosen: dict[str, list[Grasps]] = {"best_epsilon": [], "random": []}
-    steep = tilted(hand, labels, protocol.verdict.max_tilt)
-    for row in range(len(objects)):
-        own = ((labels.object == row) & ~steep).nonzero().flatten()
-        if len(own) == 0:
-            continue
-        chosen["best_epsilon"].append(labels[int(own[labels.quality[own].argmax()])])
-        chosen["random"].append(labels[int(own[int(stream(seed, "ceiling", index, row).integers(len(own)))])])
-    verdicts: dict[str, list[bool]] = {}
-    for kind, grasps in chosen.items():
-        outcomes = (
-            simulator.execute(objects, poses, hand, Grasps.cat(grasps), protocol, fixtures=fixtures) if grasps else None
-        )
-        verdicts[kind] = [] if outcomes is None else [bool(x) for x in outcomes.success]
-    return verdicts
-
-
 def summarise(episodes: Sequence[Episode], seed: int) -> dict[str, Any]:
     """Return SR, CR and epsilon with 95 % intervals (`statistics.rate_interval` over scenes)."""
     wins = [sum(a.success for a in e.attempts) for e in episodes]
@@ -225,6 +196,11 @@ def rate(top: float, bottom: int, interval: tuple[float, float]) -> dict[str, An
 def attempt_rows(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
     """Return every attempt as plain values, for results.json."""
     return [asdict(attempt) for episode in episodes for attempt in episode.attempts]
+
+
+def episode_rows(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
+    """Return of every scene which objects were there and which were removed, for results.json."""
+    return [{"scene": e.scene, "present": e.present, "removed": e.removed} for e in episodes]
 
 
 def _target(grasp: Grasps, view: View) -> int | None:

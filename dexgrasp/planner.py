@@ -43,6 +43,9 @@ class Planner(ABC):
     grants: str = "points"
     """What of a `Situation` it uses, for tables: "points", "points and masks", "meshes and poses"."""
 
+    learns: bool = False
+    """Whether there is something to `fit` before it plans."""
+
     def __init__(self, hand: Hand) -> None:
         self.hand = hand
 

@@ -8,6 +8,8 @@ import torch
 
 from dexgrasp import plugins
 from dexgrasp.backbone import Backbone
+from dexgrasp.grasps import Grasps
+from dexgrasp.planner import Planner
 from dexgrasp.testing import conforms, laws, violations
 
 for name in plugins.names("hand"):
@@ -33,6 +35,16 @@ for name in plugins.names("backbone"):
         check(backbone)
 
     globals()[f"test_backbone_{name}"] = test
+
+for name in plugins.names("planner"):
+    if plugins.load_class("planner", name).learns:  # tried by tests of its own, once it is taught
+        continue
+
+    @conforms(name)
+    def test(planner, check):
+        check(planner)
+
+    globals()[f"test_planner_{name}"] = test
 
 del test
 
@@ -157,3 +169,38 @@ class Forgetful(Backbone):
 def test_a_bad_backbone_breaks_every_law():
     holds = [law.__name__ for law, error in violations("backbone", Forgetful()) if error is None]
     assert holds == []
+
+
+class Seeing(Planner):
+    """Grasps above each object, as far as it knows of any."""
+
+    grants = "meshes and poses"
+
+    def plan(self, situation, top_k):
+        world_T_base = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)).repeat(
+            len(situation.poses), 1, 1
+        )
+        world_T_base[:, :3, 3] = situation.poses[:, :3, 3] + torch.tensor([0, 0, 0.1])
+        joints = self.hand.limits.mean(dim=1).repeat(len(world_T_base), 1)
+        grasps = Grasps.build(world_T_base, joints, len(self.hand.fingers))
+        return grasps.moved(torch.linalg.inv(situation.view.world_T_camera.double()))[:top_k]
+
+
+class Peeping(Seeing):
+    grants = "points"
+
+
+class Careless(Seeing):
+    grants = "eyes"
+
+    def plan(self, situation, top_k):
+        grasps = super().plan(situation, 100)
+        return grasps.replace(pose=(1.1 + torch.rand(1)) * grasps.pose)
+
+
+def test_what_planners_must_not_do_breaks_their_laws():
+    hand = plugins.load_hand("barrett")
+    honest = "nothing_is_used_that_is_not_granted"
+    assert [law.__name__ for law, error in violations("planner", Seeing(hand)) if error] == []
+    assert [law.__name__ for law, error in violations("planner", Peeping(hand)) if error] == [honest]
+    assert [law.__name__ for law, error in violations("planner", Careless(hand)) if error is None] == []

@@ -1,11 +1,13 @@
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 import trimesh
 
-from dexgrasp.evaluation import Policy, attempt_rows, ceilings, choose, clear, present, summarise
+from dexgrasp.ceilings import ceilings
+from dexgrasp.evaluation import Policy, attempt_rows, choose, clear, present, summarise
 from dexgrasp.grasps import Grasps, Outcomes, Reason
 from dexgrasp.objects import Object
 from dexgrasp.plugins import load_hand
@@ -79,7 +81,10 @@ def anywhere():
 
 
 def run(simulator, count=5, predict=aim, protocol=PROTOCOL):
-    return clear(0, things(count), poses(count), HAND, look, predict, simulator, protocol, Policy(), 0)
+    def answer(seen):
+        return predict(seen.view)
+
+    return clear(0, things(count), poses(count), HAND, look, answer, simulator, protocol, Policy(), 0)
 
 
 def test_clears_a_scene():
@@ -170,3 +175,19 @@ def test_ceilings_take_best_and_random_of_each_object():
     verdicts = ceilings(0, things(3), poses(3), labels, HAND, Spy(), PROTOCOL, 0)
     assert verdicts == {"best_epsilon": [True, True], "random": [True, True]}
     assert torch.equal(seen[0].quality, labels.quality[[0, 3]])
+
+
+def test_the_oracle_tries_labels_until_one_holds_and_counts_objects_without():
+    labels = grasps(poses(2)[:, :3, 3].float().repeat_interleave(20, 0))
+    labels = labels.replace(object=torch.arange(2).repeat_interleave(20))
+
+    class Nearly(Script):
+        """Lifts thing_1 by one of its labels only."""
+
+        def execute(self, objects, poses, hand, grasps, protocol, target=None, fixtures=None):
+            outcome = super().execute(objects, poses, hand, grasps, protocol, target, fixtures)
+            return replace(outcome, success=(grasps.object == 0) | (grasps.quality == labels.quality[27]))
+
+    for tries, found in ((1, False), (20, True)):
+        verdicts = ceilings(0, things(3), poses(3), labels, HAND, Nearly(), PROTOCOL, 0, oracle=tries)
+        assert verdicts["oracle"] == [True, found, False]

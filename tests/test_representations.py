@@ -1,8 +1,5 @@
 """What contact_roll, grasp_type and contact_width add to the laws that every representation obeys."""
 
-import subprocess
-import sys
-
 import pytest
 import torch
 from dexgrasp_contact_roll import ContactRoll
@@ -214,10 +211,3 @@ def test_a_few_steps_lower_the_loss(name, robot):
         optimizer.step()
         losses.append(float(loss.detach()))
     assert losses[-1] < 0.25 * losses[0]
-
-
-def test_the_sweep_over_representations_composes():
-    command = [sys.executable, "-m", "dexgrasp", "train", "experiment=representations", "--cfg", "hydra"]
-    shown = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert shown.returncode == 0, shown.stderr
-    assert "repr: contact,contact_roll,grasp_type,pose" in shown.stdout and "mode: MULTIRUN" in shown.stdout

@@ -38,6 +38,9 @@ CONFIG = "config.yaml"
 
 def main(config: DictConfig) -> None:
     """Run the main job; everything it writes but the shared data lies in one folder."""
+    if "methods" in config:
+        remedy = "python -m dexgrasp study experiment=..."
+        raise DexgraspError("an experiment that is one training", "a study of several methods", remedy)
     began = time.perf_counter()
     folder = Path(HydraConfig.get().runtime.output_dir)
     config = _begin(config, folder)

@@ -1,4 +1,4 @@
-"""The laws that every hand, representation and backbone obeys, for plugins of any origin.
+"""The laws that every hand, representation, backbone and planner obeys, for plugins of any origin.
 
 A plugin's whole test file, to be run by pytest::
 
@@ -8,9 +8,9 @@ A plugin's whole test file, to be run by pytest::
     def test(hand, check):
         check(hand)
 
-The first argument's name says the kind: `hand`, `representation` or `backbone`. One test case is made per law; a
-representation is tried on every installed hand, but those of which it says that it cannot tell their grasps
-(`UnsupportedHand`). A failed law says what was expected, what was found and what probably
+The first argument's name says the kind: `hand`, `representation`, `backbone` or `planner`. One test case is made per
+law; a representation is tried on every installed hand, but those of which it says that it cannot tell their grasps
+(`UnsupportedHand`), a planner on the BarrettHand. A failed law says what was expected, what was found and what probably
 went wrong. Without pytest: `violations("hand", hand)`.
 """
 
@@ -23,19 +23,19 @@ from typing import Any
 from dexgrasp import plugins
 from dexgrasp.testing.law import Law
 
-KINDS = {"hand": "hand", "representation": "repr", "repr": "repr", "backbone": "backbone"}
+KINDS = {"hand": "hand", "representation": "repr", "repr": "repr", "backbone": "backbone", "planner": "planner"}
 """Kind of plugin by the name of a test's first argument."""
 
 __all__ = ["Law", "conforms", "laws", "violations"]
 
 
 def laws(kind: str) -> tuple[Law, ...]:
-    """Return the laws of one kind: `hand`, `repr` or `backbone`."""
+    """Return the laws of one kind: `hand`, `repr`, `backbone` or `planner`."""
     return import_module(f"dexgrasp.testing.{kind}_laws").LAWS
 
 
 def violations(kind: str, subject: Any) -> Iterator[tuple[Law, AssertionError | None]]:
-    """Try every law on a hand, representation or backbone; yield each with what it says, None where it holds."""
+    """Try every law on a plugin's object; yield each with what it says, None where it holds."""
     for law in laws(kind):
         try:
             law(subject)
@@ -59,7 +59,7 @@ def conforms(name: str, **options: Any) -> Callable[[Callable[[Any, Law], None]]
         if first not in KINDS:
             raise TypeError(f"the first argument of {test.__name__} must be one of {', '.join(KINDS)}, not {first!r}")
         kind = KINDS[first]
-        hands = plugins.names("hand") if kind == "repr" else [None]
+        hands: list[str | None] = [*plugins.names("hand")] if kind == "repr" else [None]
         cases = [
             pytest.param(partial(_subject, kind, name, hand, tuple(sorted(options.items()))), law, id=_label(law, hand))
             for hand in hands
@@ -90,5 +90,7 @@ def _subject(kind: str, name: str, hand: str | None, options: tuple[tuple[str, A
         return plugins.load_hand(name, **dict(options))
     if kind == "backbone":
         return plugins.load_backbone(name, **dict(options))
+    if kind == "planner":
+        return plugins.load_planner(name, _subject("hand", "barrett", None, ()), **dict(options))
     assert hand is not None
     return plugins.load_representation(name, _subject("hand", hand, None, ()), channels=32, **dict(options))
