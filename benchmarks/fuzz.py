@@ -20,6 +20,7 @@ WATCHED = [
     "dexgrasp.cloud_file",
     "dexgrasp.interchange",
     "dexgrasp.dataset",
+    "dexgrasp.checkpoint",
     "pickle",
     "yaml",
     "PIL",
@@ -73,11 +74,10 @@ def fuzz(name: str, runs: int, seed: int) -> int:
     import atheris
 
     with atheris.instrument_imports(include=WATCHED):
-
         import dexgrasp.cloud_file
         import dexgrasp.interchange.formats
         import dexgrasp.sensing.mask  # noqa: F401
-    from dexgrasp.testing.readers import READERS, attempt
+        from dexgrasp.testing.readers import READERS, attempt
 
     reader, good = READERS[name]
     folder = Path(tempfile.mkdtemp(prefix="fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))

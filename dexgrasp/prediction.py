@@ -130,12 +130,15 @@ def _tips(hand: Hand, pose: Float[Tensor, "N 4 4"], joints: Float[Tensor, "N J"]
 def _at_object(hand: Hand, grasps: Grasps, sight: Sight) -> Tensor:
     """Tell which grasps touch what was seen, with no finger that touches far from their object."""
     tips = _tips(hand, grasps.pose.double(), grasps.joints.double())
-    good = grasps.contacts.isfinite().any(-1).any(-1)
+    good = torch.ones(len(grasps), dtype=torch.bool)
+    radii = torch.tensor([finger.tip_radius for finger in hand.fingers], dtype=torch.float64)
     for number in torch.unique(grasps.object).tolist():
         rows = grasps.object == number
         tree = cKDTree(sight.points[sight.labels == number])
         gaps = torch.from_numpy(tree.query(tips[rows].numpy())[0])
-        good[rows] &= ((gaps < BEHIND) | ~grasps.touching[rows]).all(dim=1)
+        touching = grasps.touching[rows]
+        near = ((gaps < BEHIND) | ~touching).all(dim=1)
+        good[rows] &= near & ((gaps - radii < PAD) & touching).any(dim=1)
     return good
 
 
