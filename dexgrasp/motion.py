@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from dexgrasp.errors import DexgraspError
 from dexgrasp.execution import closing_directions, pregrasp
+from dexgrasp.geometry import rotate
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 
@@ -148,7 +150,7 @@ def trajectory(
     closed = hand.clamp(grasp.joints + settings.squeeze * direction)[0].numpy()
     far, near, open_joints = back[0].numpy(), grasp.pose[0].numpy(), opened[0].numpy()
     raised = near.copy()
-    raised[:3, 3] += settings.lift * _direction(up, near[:3, :3] @ -hand.base_T_palm[:3, 2].numpy())
+    raised[:3, 3] += settings.lift * lift_direction(up, hand, grasp.pose)[0].numpy()
     poses, postures = [far, near, near, raised], [open_joints, open_joints, closed, closed]
     matrix, offset, names = full_joints(hand)
     most = np.minimum(speed_limits(hand), settings.joint_speed)
@@ -156,7 +158,8 @@ def trajectory(
     for phase in range(len(PHASES)):
         a, b, p, q = poses[phase], poses[phase + 1], postures[phase], postures[phase + 1]
         way, turn = b[:3, 3] - a[:3, 3], q - p
-        seconds = PEAK * max(np.linalg.norm(way) / settings.base_speed, float((np.abs(turn) / most).max(initial=0.0)))
+        slowest = float((np.abs(turn) / most).max(initial=0.0))
+        seconds = PEAK * max(float(np.linalg.norm(way)) / settings.base_speed, slowest)
         count = max(math.ceil(seconds * settings.rate), 1)
         share, speed = smooth(np.arange(0 if phase == 0 else 1, count + 1) / count)
         seconds = max(seconds, 1 / settings.rate)
@@ -213,14 +216,15 @@ def speed_limits(hand: Hand) -> Float[np.ndarray, "J"]:
         return (given[:, None] / np.abs(matrix)).min(axis=0, initial=np.inf)
 
 
-def _direction(up: Sequence[float] | None, back: np.ndarray) -> np.ndarray:
+def lift_direction(up: Sequence[float] | None, hand: Hand, pose: Float[Tensor, "N 4 4"]) -> Float[Tensor, "N 3"]:
+    """Return the unit direction of each grasp's lift in the frame of `pose`: `up`, or back against the approach."""
     if up is None:
-        return back
-    given = np.asarray(up, dtype=np.float64)
-    length = float(np.linalg.norm(given)) if given.shape == (3,) else 0.0
-    if not (math.isfinite(length) and length > 0):
+        return rotate(pose, -hand.base_T_palm[:3, 2].to(pose).expand(len(pose), 3))
+    given = torch.as_tensor(up, dtype=pose.dtype)
+    length = float(given.norm())
+    if given.shape != (3,) or not (math.isfinite(length) and length > 0):
         raise DexgraspError("three finite numbers, not all 0, as `up`", repr(up), "give it in the grasp's frame")
-    return given / length
+    return (given / length).expand(len(pose), 3)
 
 
 def _check(grasp: Grasps, hand: Hand) -> None:
