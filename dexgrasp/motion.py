@@ -78,13 +78,19 @@ class Trajectory:
     """rad/s or m/s."""
     ends: tuple[int, ...]
     """Samples of the four `WAYPOINTS`."""
+    arm_joint_names: tuple[str, ...] = ()
+    """Joints of the arm that carries the hand, where there is one: `dexgrasp.arm_motion.with_arm`."""
+    arm_joints: Float[np.ndarray, "T A"] | None = None
+    """rad, or m where prismatic."""
+    arm_speeds: Float[np.ndarray, "T A"] | None = None
+    """rad/s or m/s."""
 
     def __len__(self) -> int:
         return len(self.time)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values: the documented JSON of docs/motion.md, `dexgrasp_trajectory` version 1."""
-        return {
+        told: dict[str, Any] = {
             "format": "dexgrasp_trajectory",
             "format_version": 1,
             "hand": self.hand,
@@ -102,6 +108,10 @@ class Trajectory:
                 "speeds": self.speeds.tolist(),
             },
         }
+        if self.arm_joints is not None and self.arm_speeds is not None:
+            told["arm_joint_names"] = list(self.arm_joint_names)
+            told["samples"] |= {"arm_joints": self.arm_joints.tolist(), "arm_speeds": self.arm_speeds.tolist()}
+        return told
 
     def save(self, path: str | Path) -> Path:
         """Write `as_dict` as JSON."""
@@ -109,12 +119,15 @@ class Trajectory:
         return Path(path)
 
     def _waypoint(self, name: str, row: int) -> dict[str, Any]:
-        return {
+        told: dict[str, Any] = {
             "name": name,
             "time": float(self.time[row]),
             "frame_T_base": self.pose[row].tolist(),
             "joints": dict(zip(self.joint_names, self.joints[row].tolist(), strict=True)),
         }
+        if self.arm_joints is not None:
+            told["arm_joints"] = dict(zip(self.arm_joint_names, self.arm_joints[row].tolist(), strict=True))
+        return told
 
 
 def trajectory(

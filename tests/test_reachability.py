@@ -6,6 +6,7 @@ import torch
 
 from dexgrasp import geometry, load_arm, load_hand, reachable, trajectory
 from dexgrasp.arm_collision import ArmBody
+from dexgrasp.arm_motion import with_arm
 from dexgrasp.errors import DexgraspError
 from dexgrasp.grasps import Grasps
 from dexgrasp.inverse_kinematics import solutions
@@ -139,3 +140,26 @@ def test_bad_input_is_told(panda, hand, tmp_path):
         reachable(panda, hand, downward(hand, [[0.5, 0, 0.2]]), None, 1000 * NOWHERE)
     lost = downward(hand, [[0.5, 0.0, float("nan")], [0.5, 0.0, 0.25]])
     assert reachable(panda, hand, lost, None, NOWHERE).order.tolist() == [1, 0]
+
+
+def test_the_arm_moves_with_the_hand(panda, hand):
+    grasps = downward(hand, [[0.5, 0.1, 0.25], [2.0, 0.0, 0.2]])
+    reach = reachable(panda, hand, grasps, None, NOWHERE, up=(0, 0, 1))
+    fast = TrajectorySettings(base_speed=3.0, rate=200)
+    told = trajectory(grasps[0], hand, fast, frame="arm", up=(0, 0, 1))
+    both = with_arm(told, panda, reach, 0)
+    joints, limits = torch.from_numpy(both.arm_joints), panda.limits
+    base = panda.link_poses(joints)[panda.flange] @ panda.flange_T_hand
+    assert float((base - torch.from_numpy(both.pose))[:, :3, 3].norm(dim=1).max()) < 1e-3, "straight within 1 mm"
+    assert bool(((joints >= limits[:, 0]) & (joints <= limits[:, 1])).all())
+    assert both.time[-1] > told.time[-1], "3 m/s is too fast for the arm"
+    speeds = torch.from_numpy(both.arm_speeds)
+    assert float((speeds.abs() / panda.speeds).max()) == pytest.approx(1.0)
+    step = torch.from_numpy(both.time).diff()[:, None]
+    assert float((joints.diff(dim=0) / step - 0.5 * (speeds[1:] + speeds[:-1])).abs().max()) < 0.05
+    assert both.as_dict()["waypoints"][0]["arm_joints"].keys() == set(panda.joint_names)
+    with pytest.raises(DexgraspError, match="reaches"):
+        with_arm(told, panda, reach, 1)
+    with pytest.raises(DexgraspError, match="same settings"):
+        with_arm(trajectory(grasps[0], hand, up=(0, 0, 1)), panda, reachable(
+            panda, hand, grasps[0], None, NOWHERE, up=(0, 0, 1), motion=TrajectorySettings(lift=0.05)), 0)  # fmt: skip
