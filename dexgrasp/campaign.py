@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import joblib
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -27,14 +28,18 @@ from dexgrasp.model import GraspNet, load_model
 from dexgrasp.objects import Object
 from dexgrasp.planner import Planner, Situation
 from dexgrasp.plugins import build_planner
+from dexgrasp.prediction import predict_sight
 from dexgrasp.progress import track
 from dexgrasp.scene import View
 from dexgrasp.seeds import stream
+from dexgrasp.segmentation import clusters
 from dexgrasp.selection import Selection
 from dexgrasp.settings import read
+from dexgrasp.sight import Sight
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.statistics import rate_interval
+from dexgrasp.table import find_tabletop
 from dexgrasp.wrench_model import WrenchModel
 
 
@@ -53,6 +58,8 @@ class Campaign:
     seed: int
     planner: Mapping[str, Any] | None = None
     """Resolved config of the group `planner`."""
+    segmented: bool = False
+    """Whether a network's grasps are those of `predict`: of objects segmented by geometry, closed on what was seen."""
     oracle: int = 0
     """Labels of each object that the oracle may try, see `ceilings`."""
     drawn: int = 8
@@ -97,7 +104,13 @@ class Campaign:
         if self.model is None:
             return self._planner().plan(situation, self.top_k)
         view, network = situation.view, _network(self.model, self.model.stat().st_mtime_ns)
-        grasps = network.predict(view.points, view.normals, self.top_k, self.selection, self.seed)
+        if self.segmented:
+            seen = sight(view, self.seed)
+            if seen.objects == 0:
+                return Grasps.none(len(self.dataset.hand.joint_names), len(self.dataset.hand.fingers))
+            grasps = predict_sight(network, seen, self.top_k, self.selection, seed=self.seed).grasps
+        else:
+            grasps = network.predict(view.points, view.normals, self.top_k, self.selection, self.seed)
         return grasps if network.scorer is None else grasps[grasps.quality >= self.policy.min_lift]
 
     def _planner(self) -> Planner:
@@ -147,6 +160,14 @@ def _work(campaign: Campaign, index: int, label_ceilings: bool) -> tuple[Episode
         return episode, verdicts
     finally:
         torch.set_num_threads(threads)
+
+
+def sight(view: View, seed: int) -> Sight:
+    """Return a view with its table and its objects by geometry alone."""
+    points, normals = view.points.double().numpy(), view.normals.double().numpy()
+    table = find_tabletop(torch.from_numpy(np.hstack([points, normals])), seed)
+    known = None if table is None else table.numpy()
+    return Sight(points, normals, clusters(points, known), known, np.eye(4))
 
 
 @lru_cache(1)

@@ -19,11 +19,12 @@ NEIGHBOURS = 120
 Array = Float[np.ndarray, "P 3"] | Float[Tensor, "P 3"]
 
 
-def prepare(points: Array, normals: Array | None, count: int, seed: int) -> Float[Tensor, "N 6"]:
+def prepare(points: Array, normals: Array | None, count: int, seed: int, outward: bool = False) -> Float[Tensor, "N 6"]:
     """Return positions (m) and unit normals towards the camera of at most `count` points, float32, on the CPU.
 
     Points are in the camera frame. Larger clouds are thinned at random, the dominant plane more than the rest; the
-    same for the same seed. Raises `DexgraspError` for anything that is not a cloud in metres.
+    same for the same seed. Normals that are `outward` already, of views from several sides, are not turned. Raises
+    `DexgraspError` for anything that is not a cloud in metres.
     """
     xyz = _checked("points", points)
     if len(xyz) < FEWEST:
@@ -35,7 +36,7 @@ def prepare(points: Array, normals: Array | None, count: int, seed: int) -> Floa
             f"a median distance of {distance:.4g} from the camera, which looks like millimetres",
             "divide the points by 1000 (`predict`: scale=0.001)",
         )
-    directions = None if normals is None else _unit(xyz, _checked("normals", normals))
+    directions = None if normals is None else _unit(xyz, _checked("normals", normals), outward)
     if directions is None and len(xyz) > DENSE * count:
         xyz = xyz[_thin(xyz, DENSE * count, seed)]
     chosen = _thin(xyz, count, seed)
@@ -57,15 +58,15 @@ def _thin(xyz: Float[Tensor, "P 3"], count: int, seed: int) -> Int[Tensor, "N"]:
     return torch.from_numpy(downsample(xyz.numpy(), Framing(points=count), stream(seed, "thin", count)))
 
 
-def _unit(xyz: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-    """Return unit normals on the camera's side."""
+def _unit(xyz: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"], outward: bool) -> Float[Tensor, "P 3"]:
+    """Return unit normals, on the camera's side unless they are `outward` already."""
     if normals.shape != xyz.shape:
         raise DexgraspError(f"one normal per point, {tuple(xyz.shape)}", f"{tuple(normals.shape)}", "match them")
     length = torch.linalg.vector_norm(normals, dim=1, keepdim=True)
     if (length == 0).any():
         raise DexgraspError("normals of non-zero length", f"{int((length == 0).sum())} zeros", "leave normals out")
     unit = normals / length
-    return torch.where((unit * xyz).sum(1, keepdim=True) > 0, -unit, unit)
+    return unit if outward else torch.where((unit * xyz).sum(1, keepdim=True) > 0, -unit, unit)
 
 
 def _checked(name: str, values: Array) -> Float[Tensor, "P 3"]:

@@ -1,99 +1,220 @@
-"""Point clouds from files."""
+"""What one camera saw, from a file: a cloud, or a depth image with its intrinsics."""
 
+import io
+import zipfile
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from trimesh.exchange.ply import load_ply
 
 from dexgrasp.errors import DexgraspError
+from dexgrasp.sensing.depth_image import KEY, metres, parse_png, unit_of
+from dexgrasp.sensing.intrinsics import Intrinsics, read_intrinsics
+from dexgrasp.sensing.limits import FILE, counted, sized
+from dexgrasp.sensing.pcd import parse_pcd
+from dexgrasp.sensing.ply import parse_ply
 
 Array = NDArray[np.float64]
-KINDS = (".ply", ".pcd", ".npy", ".npz")
+KINDS = (".ply", ".pcd", ".npy", ".npz", ".xyz", ".txt", ".png")
+NARROWEST = 16
+"""Fewest rows and columns of a depth image that says in no other way that it is one."""
 
 
-def read_cloud(path: Path, scale: float = 1.0) -> tuple[Array, Array | None]:
-    """Return points (P, 3) in the camera frame, m, and normals (P, 3) where the file has them.
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """What one camera saw, as its file tells it."""
+
+    points: Array
+    """(P, 3), m; only what was measured."""
+    normals: Array | None
+    """(P, 3), where the file has them."""
+    rows: NDArray[np.int64]
+    """(P,) where each point stands in the file: row, or pixel (row * W + column)."""
+    total: int
+    """Rows or pixels of the file."""
+    shape: tuple[int, int] | None = None
+    """Height and width where the points are pixels of an image."""
+    viewpoint: Array | None = None
+    """(3,) where the camera stood in the frame of the points, m, where the file tells it."""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def some(self, which: NDArray[Any]) -> "Capture":
+        """Return the points of a mask or of indices."""
+        normals = None if self.normals is None else self.normals[which]
+        return replace(self, points=self.points[which], normals=normals, rows=self.rows[which])
+
+
+def read_cloud(path: str | Path, scale: float | None = None, intrinsics: Intrinsics | None = None) -> Capture:
+    """Return what a file holds.
 
     Args:
-        path: ``.ply``; ``.pcd`` (ascii or binary); ``.npy`` (P, 3) or (P, 6); ``.npz`` with `points` and maybe
-            `normals`, or with `depth` (H, W) along the optical axis and the camera matrix `K` (3, 3).
-        scale: metres per unit of the file (0.001 for millimetres).
+        path: ``.ply``; ``.pcd`` (ascii, binary, compressed); ``.xyz`` or ``.txt`` (x y z, perhaps normals, a line);
+            ``.npy`` (P, 3), (P, 6) or (H, W, 3), or a depth image (H, W); ``.npz`` with `points` and maybe `normals`,
+            or with `depth` (or depth_mm, depth_0p1mm, ...) and maybe `K`; ``.png`` with 16-bit depth. Depth is along
+            the optical axis.
+        scale: metres per unit of the file; None: clouds are in metres, depth of whole numbers in millimetres, unless
+            the array's name tells the unit.
+        intrinsics: of a depth image; None: the file must hold them.
 
-    Points without depth (NaN, or zero depth) are left out. Raises DexgraspError for a file that is none of these.
+    Points without depth (NaN, or zero depth) are left out. Raises DexgraspError for a file that is none of these, is
+    larger than `dexgrasp.sensing.limits` allow, or has no point.
     """
-    if path.suffix not in KINDS:
-        raise DexgraspError(f"a cloud: {', '.join(KINDS)}", str(path), "convert the file")
-    if not path.is_file():
-        raise DexgraspError("a file with a cloud", f"no file {path}", "check the path")
+    path = Path(path).expanduser()
+    kind = path.suffix.lower()
+    if kind not in KINDS:
+        raise DexgraspError(f"a cloud or depth image: {', '.join(KINDS)}", str(path), "convert the file")
+    content = sized(path).read_bytes()
+    return parse(content, kind, str(path), scale, intrinsics)
+
+
+def parse(
+    content: bytes, kind: str, where: str, scale: float | None = None, intrinsics: Intrinsics | None = None
+) -> Capture:
+    """Return what the content of a file of that kind (".ply", ...) holds; as `read_cloud`."""
+    if not content:
+        raise DexgraspError(f"points in {where}", "an empty file", "measure or write it again")
+    shape, viewpoint = None, None
+    factor = 1.0 if scale is None else scale
     try:
-        rows = {".ply": _ply, ".pcd": _pcd, ".npy": _npy, ".npz": _npz}[path.suffix](path)
-    except (ValueError, KeyError, IndexError, EOFError, OSError) as error:
-        raise DexgraspError(
-            f"a readable {path.suffix} file", f"{path}: {type(error).__name__}: {error}", "write the file again"
-        ) from error
-    measured = np.isfinite(rows).all(axis=1)
+        if kind == ".pcd":
+            rows, shape, viewpoint = parse_pcd(content)
+            viewpoint = factor * viewpoint if viewpoint.any() else None
+        elif kind == ".ply":
+            rows = parse_ply(content)
+        elif kind in (".xyz", ".txt"):
+            rows = _text(content)
+        elif kind == ".png":
+            rows, shape = _depth(parse_png(content), scale, intrinsics, where)
+            factor = 1.0
+        else:
+            rows, shape, factor = _arrays(content, kind, scale, intrinsics, where)
+    except (ValueError, KeyError, IndexError, EOFError, OSError, TypeError, OverflowError, SyntaxError) as error:
+        raise _unreadable(kind, where, error) from error
+    except (
+        MemoryError,
+        zipfile.BadZipFile,
+        RecursionError,
+        AttributeError,
+        NotImplementedError,
+        RuntimeError,
+    ) as error:
+        raise _unreadable(kind, where, error) from error
+    with np.errstate(over="ignore", invalid="ignore"):
+        points = factor * rows[:, :3]
+    # Anything beyond is no measurement, and would overflow.
+    measured = np.isfinite(rows).all(axis=1) & (np.abs(points) < 1e9).all(axis=1)
     if not measured.any():
         raise DexgraspError(
-            f"points with numbers in {path}", f"{len(rows)}, all of them NaN or infinite", "measure again"
+            f"points with numbers in {where}",
+            f"{len(rows)} points, none of them measured (NaN, infinite, or without depth)",
+            "measure again",
         )
-    rows = rows[measured]
-    return rows[:, :3] * scale, rows[:, 3:6] if rows.shape[1] >= 6 else None
+    normals = rows[measured, 3:6] if rows.shape[1] >= 6 else None
+    return Capture(points[measured], normals, np.flatnonzero(measured), len(rows), shape, viewpoint)
 
 
-def _ply(path: Path) -> Array:
-    with path.open("rb") as file:
-        found = load_ply(file)
-    normals = found.get("vertex_normals")
-    return np.hstack([found["vertices"], *([] if normals is None else [normals])]).astype(np.float64)
+def _unreadable(kind: str, where: str, error: Exception) -> DexgraspError:
+    found = " ".join(str(error).split())[:300]
+    return DexgraspError(f"a readable {kind} file", f"{where}: {type(error).__name__}: {found}", "write the file again")
 
 
-def _npy(path: Path) -> Array:
-    rows = np.load(path, allow_pickle=False).astype(np.float64)
-    if rows.ndim != 2 or rows.shape[1] not in (3, 6):
-        raise ValueError(f"an array of shape {rows.shape}, not (P, 3) or (P, 6)")
-    return rows
+def _text(content: bytes) -> Array:
+    lines = [line.split(b"#")[0].replace(b",", b" ").split() for line in content.splitlines()]
+    lines = [line for line in lines if line]
+    width = len(lines[0]) if lines else 0
+    if width < 3 or any(len(line) != width for line in lines):
+        raise ValueError("lines that are not all of the same three or more numbers")
+    rows = np.array(lines, dtype=np.float64)
+    # Of four or five numbers the last are colour or intensity.
+    return rows[:, :6] if width == 6 else rows[:, :3]
 
 
-def _npz(path: Path) -> Array:
-    with np.load(path, allow_pickle=False) as data:
-        if "points" in data:
-            points = data["points"].reshape(-1, 3).astype(np.float64)
-            return np.hstack([points, data["normals"].reshape(-1, 3)]) if "normals" in data else points
-        if not {"depth", "K"} <= set(data):
-            raise ValueError(f"arrays {sorted(data)}, not points (and normals), or depth and K")
-        depth, camera = data["depth"].astype(np.float64), data["K"].astype(np.float64)
-    v, u = np.nonzero(np.isfinite(depth) & (depth > 0))
-    rays = np.stack([u, v, np.ones_like(u)], axis=1) @ np.linalg.inv(camera).T
-    return rays * depth[v, u, None]
+def _arrays(
+    content: bytes, kind: str, scale: float | None, intrinsics: Intrinsics | None, where: str
+) -> tuple[Array, tuple[int, int] | None, float]:
+    """Return rows, the image's shape, and metres per unit of the rows."""
+    factor = 1.0 if scale is None else scale
+    if kind == ".npy":
+        image = load_npy(content)
+        if image.ndim == 2 and image.shape[1] in (3, 6):
+            return image.astype(np.float64), None, factor
+        if image.ndim == 3 and image.shape[2] == 3:
+            return image.reshape(-1, 3).astype(np.float64), image.shape[:2], factor
+        if image.ndim != 2 or min(image.shape) < NARROWEST:
+            raise ValueError(f"an array of shape {image.shape}, not (P, 3), (P, 6), (H, W, 3), or (H, W) of depth")
+        return (*_depth(image, scale, intrinsics, where), 1.0)
+    arrays = load_npz(content)
+    if "points" in arrays:
+        points = arrays["points"]
+        shape = points.shape[:2] if points.ndim == 3 else None
+        rows = points.reshape(-1, 3).astype(np.float64)
+        if "normals" in arrays:
+            rows = np.hstack([rows, arrays["normals"].reshape(-1, 3).astype(np.float64)])
+        return rows, shape, factor
+    name = next((name for name in arrays if KEY.fullmatch(name)), None)
+    if name is None:
+        raise ValueError(f"arrays {sorted(arrays)}, not points (and normals), or depth and K")
+    if intrinsics is None and "K" in arrays:
+        intrinsics = read_intrinsics(arrays["K"])
+    return (*_depth(arrays[name], unit_of(name) if scale is None else scale, intrinsics, where), 1.0)
 
 
-def _pcd(path: Path) -> Array:
-    content = path.read_bytes()
-    header: dict[str, list[str]] = {}
-    start = 0
-    while "DATA" not in header:
-        end = content.index(b"\n", start)
-        words = content[start:end].decode("ascii").split()
-        if words and not words[0].startswith("#"):
-            header[words[0]] = words[1:]
-        start = end + 1
-    kinds = [f"{kind.lower()}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
-    counts = map(int, header.get("COUNT", ["1"] * len(kinds)))
-    layout = np.dtype([(n, k, (c,)) for n, k, c in zip(header["FIELDS"], kinds, counts, strict=True)])
-    count = int(header["POINTS"][0])
-    if header["DATA"] == ["binary"]:
-        fields = np.frombuffer(content, layout, count, start)
-        columns = {name: fields[name][:, 0] for name in header["FIELDS"]}
-    elif header["DATA"] == ["ascii"]:
-        table = np.array(content[start:].decode("ascii").split(), dtype=np.float64).reshape(count, -1)
-        starts = np.cumsum([0, *(layout[name].shape[0] for name in header["FIELDS"])])
-        columns = {name: table[:, at] for name, at in zip(header["FIELDS"], starts, strict=False)}
-    else:
-        raise ValueError(
-            f"DATA {' '.join(header['DATA'])}, not ascii or binary: convert it with pcl_convert_pcd_ascii_binary"
+def _depth(
+    image: NDArray[np.generic], scale: float | None, intrinsics: Intrinsics | None, where: str
+) -> tuple[Array, tuple[int, int]]:
+    depth = metres(image, scale)
+    if intrinsics is None:
+        raise DexgraspError(
+            f"the intrinsics of the depth image {where}",
+            "none",
+            "tell them: intrinsics=[fx,fy,cx,cy] or intrinsics=camera_info.yaml",
         )
-    wanted = ["x", "y", "z"]
-    if {"normal_x", "normal_y", "normal_z"} <= columns.keys():
-        wanted += ["normal_x", "normal_y", "normal_z"]
-    return np.stack([columns[name] for name in wanted], axis=1).astype(np.float64)
+    return intrinsics.points(depth), (depth.shape[0], depth.shape[1])
+
+
+def load_npy(content: bytes) -> NDArray[Any]:
+    """Return the array of a .npy file's content, numbers only; raises ValueError."""
+    file = io.BytesIO(content)
+    version = np.lib.format.read_magic(file)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = header(file)
+    if dtype.kind not in "biuf":
+        raise ValueError(f"an array of {dtype}, not of numbers")
+    size = 1
+    for side in shape:
+        size *= int(side)
+    counted(size // 3, "the array")
+    if size * dtype.itemsize > len(content):
+        raise ValueError(f"{len(content)} bytes for an array of shape {shape} and type {dtype}")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def load_npz(content: bytes) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a .npz file's content; raises ValueError where they unpack to more than the limit."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = [each for each in archive.infolist() if each.filename.endswith(".npy")]
+        if sum(each.file_size for each in members) > FILE:
+            raise ValueError(f"arrays of more than {FILE >> 20} MiB")
+        found = {}
+        for each in members:
+            with archive.open(each) as member:  # what the directory says of the size is not trusted
+                plain = member.read(min(each.file_size, FILE) + 1)
+            array = _one(plain)
+            if array is not None:
+                found[each.filename.removesuffix(".npy")] = array
+    return found
+
+
+def _one(content: bytes) -> NDArray[Any] | None:
+    """Return an array, None for one that holds no numbers: it is not asked for."""
+    try:
+        return load_npy(content)
+    except ValueError as error:
+        if "not of numbers" in str(error):
+            return None
+        raise

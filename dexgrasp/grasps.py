@@ -36,6 +36,11 @@ class Grasps(Batch):
     """Fingers that close until they touch; the others stay as `joints` tell them, open and out of the way."""
 
     @classmethod
+    def none(cls, joints: int, fingers: int) -> "Grasps":
+        """Return no grasps of a hand with so many joints and fingers, float64."""
+        return cls.build(torch.zeros(0, 4, 4, dtype=torch.float64), torch.zeros(0, joints).double(), fingers)
+
+    @classmethod
     def build(
         cls,
         pose: Float[Tensor, "N 4 4"],

@@ -154,6 +154,11 @@ def finger_loss(
     return (weight * loss).sum() / weight.sum().clamp(min=1e-6)
 
 
+def any_finger(logits: Float[Tensor, "N K"]) -> Float[Tensor, "N"]:
+    """Return the logit of the probability that a point is graspable, of the classes none and fingers."""
+    return logits[:, 1:].logsumexp(dim=-1) - logits[:, 0]
+
+
 def told_grasps(
     hand: Hand,
     points: Float[Tensor, "N 3"],

@@ -22,10 +22,10 @@ PALETTE = ((0.86, 0.45, 0.35), (0.40, 0.62, 0.80), (0.55, 0.74, 0.44), (0.85, 0.
 HAND = (0.35, 0.37, 0.42)
 
 
-def write_results(folder: Path, kind: str, results: Mapping[str, Any]) -> Path:
+def write_results(folder: Path, kind: str, results: Mapping[str, Any], version: int = 1) -> Path:
     """Write results.json of a command; the schemas are documented in docs/results.md."""
     path = folder / "results.json"
-    content = {"schema": f"dexgrasp.{kind}/1", **results}
+    content = {"schema": f"dexgrasp.{kind}/{version}", **results}
     replace_file(path, (json.dumps(content, indent=1, allow_nan=False, default=str) + "\n").encode())
     return path
 

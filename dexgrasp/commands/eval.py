@@ -42,6 +42,8 @@ class Settings:
         for key in ("top_k", "drawn", "oracle"):
             if type(options[key]) is not int or options[key] < 0:
                 raise DexgraspError(f"evaluation.{key} to be a whole number", repr(options[key]), "set it so")
+        if type(options["segmented"]) is not bool:
+            raise DexgraspError("evaluation.segmented: true or false", repr(options["segmented"]), "set it so")
         stages.Settings.read(options["dataset"])
         return cls(
             {str(key): value for key, value in options.items()},
@@ -94,6 +96,7 @@ def evaluate(config: DictConfig, hand: Mapping[str, Any], checkpoint: Path | Non
         top_k=options["top_k"],
         seed=config.seed,
         drawn=options["drawn"],
+        segmented=options["segmented"],
         oracle=options["oracle"],
     )
     workers = options["workers"] or len(os.sched_getaffinity(0))
@@ -102,6 +105,7 @@ def evaluate(config: DictConfig, hand: Mapping[str, Any], checkpoint: Path | Non
         "title": f"{campaign.protocol.name}: {name}",
         "model": None if checkpoint is None else str(checkpoint),
         "planner": planner,
+        "segmented": options["segmented"],
         "hand": dataset.hand.name,
         "data": {"hash": scenes_hash(dataset), "objects": len(dataset.objects), "scenes": dataset.scenes},
         "extents": {item.name: float(np.ptp(item.mesh.vertices, axis=0).max()) for item in dataset.objects},
