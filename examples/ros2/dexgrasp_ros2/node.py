@@ -19,6 +19,7 @@ def main() -> None:
     """Start the node; Ctrl-C ends it."""
     try:
         import rclpy
+        from rclpy.executors import ExternalShutdownException
     except ImportError:
         sys.exit("rclpy is not there: source ROS 2's setup.bash first, with the Python for which it was built")
     rclpy.init()
@@ -26,10 +27,11 @@ def main() -> None:
     Planning(node)
     try:
         rclpy.spin(node)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
         node.destroy_node()
+        rclpy.try_shutdown()
 
 
 class Planning:

@@ -107,6 +107,37 @@ def test_a_plan_with_an_arm_takes_what_it_reaches():
     assert details["trajectory"]["waypoints"][1]["name"] == "grasp"
 
 
+def test_the_node_answers_with_the_newest_cloud(monkeypatch):
+    """With stand-ins for ROS: the wiring, not ROS itself."""
+    kinds = {"geometry_msgs.msg": "PoseArray", "sensor_msgs.msg": "PointCloud2", "std_msgs.msg": "String"}
+    kinds |= {"std_srvs.srv": "Trigger", "trajectory_msgs.msg": "JointTrajectory"}
+    modules = {name: {kind: type(kind, (), {})} for name, kind in kinds.items()}
+    modules |= {"rclpy.qos": {"qos_profile_sensor_data": 10}}
+    modules |= {
+        "rosidl_runtime_py.set_message": {"set_message_fields": lambda message, told: vars(message).update(told)}
+    }
+    for name, holds in modules.items():
+        monkeypatch.setitem(sys.modules, name.partition(".")[0], SimpleNamespace(__path__=[]))
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(**holds))
+    monkeypatch.setattr("dexgrasp_ros2.node.load_model", lambda name: Model())
+    sent = {}
+    node = SimpleNamespace(
+        declare_parameter=lambda name, default: SimpleNamespace(value=default),
+        create_publisher=lambda kind, topic, depth: SimpleNamespace(publish=lambda made: sent.update({topic: made})),
+        create_subscription=lambda *given: None,
+        create_service=lambda *given: None,
+    )
+    planning = Planning(node)
+    answer = planning.plan(None, SimpleNamespace())
+    assert not answer.success and "none yet" in answer.message
+    planning.keep(message(scene()))
+    answer = planning.plan(None, SimpleNamespace())
+    assert answer.success and answer.message == "2 grasps"
+    assert set(sent) == {"~/grasps", "~/hand_trajectory", "~/details"}
+    assert sent["~/grasps"].header == {"stamp": {"sec": 3, "nanosec": 5}, "frame_id": "camera"}
+    assert len(json.loads(sent["~/details"].data)["grasps"]) == 2
+
+
 def test_without_ros_the_node_says_what_to_do(monkeypatch):
     assert Planning and not any(name.partition(".")[0] == "rclpy" for name in sys.modules)
     monkeypatch.setitem(sys.modules, "rclpy", None)
