@@ -44,6 +44,8 @@ def test_it_keeps_limits_is_continuous_and_couples_joints(name):
     base = np.linalg.norm(np.diff(told.pose[:, :3, 3], axis=0), axis=1) / step
     assert base.max() <= settings.base_speed + 1e-9
     assert np.abs(told.speeds[list(told.ends)]).max() < 1e-9
+    wide = trajectory(grasp, hand, TrajectorySettings(opening=3, squeeze=3)).joints
+    assert (wide <= hand.model.upperPositionLimit + 1e-9).all() and (wide >= hand.model.lowerPositionLimit - 1e-9).all()
     # Coupled joints, by Pinocchio's own model of the URDF with all joints ordinary: links where the hand has them.
     model, row = hand.model, len(told) // 2
     data = model.createData()

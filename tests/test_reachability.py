@@ -163,3 +163,8 @@ def test_the_arm_moves_with_the_hand(panda, hand):
     with pytest.raises(DexgraspError, match="same settings"):
         with_arm(trajectory(grasps[0], hand, up=(0, 0, 1)), panda, reachable(
             panda, hand, grasps[0], None, NOWHERE, up=(0, 0, 1), motion=TrajectorySettings(lift=0.05)), 0)  # fmt: skip
+
+
+def test_nothing_to_reach_is_no_error(panda, hand):
+    told = reachable(panda, hand, downward(hand, [[0.5, 0, 0.2]])[:0], torch.rand(100, 3), NOWHERE)
+    assert len(told.order) == len(told.reachable) == len(told.reason) == 0
