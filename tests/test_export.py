@@ -1,5 +1,7 @@
 """Exported graphs say what the network says; shipped weights load by name and carry a card."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,8 @@ from dexgrasp.export_check import compare, level_views, runner
 from dexgrasp.model import GraspNet, build_model, save_model
 from dexgrasp.plugins import conf_folders, read
 from dexgrasp.scorer import Scorer
+from dexgrasp.selection import Selection
+from dexgrasp.testing.views import seen_scenes
 
 BACKBONE = {
     "name": "pointnet2",
@@ -89,3 +93,20 @@ def test_what_is_not_shipped(model, tmp_path, monkeypatch):
     with pytest.raises(DexgraspError, match="of shipped weights"):
         shipping.ship(path, "tiny", tmp_path / "weights")
     assert not (tmp_path / "weights").exists()
+
+
+@pytest.mark.slow
+def test_the_example_needs_no_torch(model, tmp_path):
+    for package in ("onnxscript", "onnxruntime"):
+        pytest.importorskip(package)
+    trace(model, next(level_views(model, 1)), "grasps").write(tmp_path / "grasps.onnx")
+    points = next(seen_scenes(1, 1024))
+    np.save(tmp_path / "cloud.npy", points)
+    script = Path(__file__).resolve().parents[1] / "examples/onnx/predict.py"
+    command = f"import runpy, sys; sys.modules['torch'] = None; runpy.run_path({str(script)!r}, run_name='__main__')"
+    words = [sys.executable, "-c", command, "grasps.onnx", "cloud.npy", "--top", "3"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
+    rows = [[float(word) for word in line.split()] for line in done.stdout.splitlines()[1:]]
+    expected = model.predict(points, top_k=3, selection=Selection(depth=None, table=None, distance=0))
+    np.testing.assert_allclose([row[0] for row in rows], expected.quality, atol=0.02)

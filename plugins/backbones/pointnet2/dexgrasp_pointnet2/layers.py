@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from dexgrasp.heads import Layers
 from dexgrasp_pointnet2.pooling import ball_max
 
 
@@ -16,7 +17,7 @@ def mlp(widths: Sequence[int]) -> nn.Sequential:
     layers: list[nn.Module] = []
     for before, after in itertools.pairwise(widths):
         layers += [nn.Linear(before, after, bias=False), nn.BatchNorm1d(after), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers)
+    return Layers(*layers)
 
 
 class SetAbstraction(nn.Module):

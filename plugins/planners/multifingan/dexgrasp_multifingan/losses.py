@@ -33,7 +33,7 @@ def surface_distance(
 
 
 def contact(tips: Float[Tensor, "B F T"], touching: Bool[Tensor, "B F"]) -> Float[Tensor, "B"]:
-    """Return how far fingertips that shall touch are from doing so, on average, m; `tips` are their points' distances."""
+    """Return how far fingertips that shall touch are off on average, m; `tips` are the distances of their points."""
     off = tips.amin(-1).abs() * touching
     return off.sum(-1) / touching.sum(-1).clamp(min=1)
 

@@ -1,5 +1,7 @@
 """The networks: an object's feature and grasp type, the generator that refines, the critic that tells true grasps."""
 
+from itertools import pairwise
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -13,7 +15,7 @@ UNIT = 0.1
 
 def mlp(*widths: int) -> nn.Sequential:
     """Return linear layers with leaky rectifiers between them."""
-    layers = [[nn.Linear(a, b), nn.LeakyReLU(0.1)] for a, b in zip(widths[:-1], widths[1:], strict=True)]
+    layers = [[nn.Linear(a, b), nn.LeakyReLU(0.1)] for a, b in pairwise(widths)]
     return nn.Sequential(*[layer for pair in layers for layer in pair][:-1])
 
 

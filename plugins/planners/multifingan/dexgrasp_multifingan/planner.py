@@ -79,6 +79,12 @@ class MultiFinGan(Planner):
         load_state(networks, tensors, path)
         self.networks = networks.eval()
 
+    def save(self, folder: Path) -> None:
+        """Write what is learnt, with the hand's check, whole or not at all."""
+        assert self.networks is not None
+        notes = {"kind": KIND, "hand": kinematics(self.hand), "sizes": self.sizes, "points": self.points}
+        write_tensors(Path(folder) / FILE, self.networks.state_dict(), notes)
+
     def fit(self, dataset: Dataset, seed: int, folder: Path) -> dict[str, Any]:
         """Train on the objects of split "train" as seen, and their feasible grasps; write weights into `folder`."""
         check_hand(self.hand, kinematics(dataset.hand), Path("the dataset"))
@@ -88,8 +94,7 @@ class MultiFinGan(Planner):
             networks = Networks(self.hand, **self.sizes)
         losses = Fitting(networks, found, dataset.field, self.settings, seed).run()
         self.networks = networks.eval()
-        notes = {"kind": KIND, "hand": kinematics(self.hand), "sizes": self.sizes, "points": self.points}
-        write_tensors(Path(folder) / FILE, networks.state_dict(), notes)
+        self.save(folder)
         count = sum(value.numel() for value in networks.parameters())
         grasps = sum(len(example.base) for example in found)
         return {"examples": len(found), "grasps": grasps, "parameters": count, "losses": losses}
@@ -110,10 +115,8 @@ class MultiFinGan(Planner):
         told = partial(self._of_object, self.networks, situation.seed)
         found = [told(row, level[view.instance == row]) for row in seen]
         if not found:
-            nothing = torch.zeros(0, 4, 4, dtype=torch.float64)
-            return Grasps.build(
-                nothing, nothing[:, 0, :1].expand(0, len(self.hand.joint_names)), len(self.hand.fingers)
-            )
+            pose, joints = torch.zeros(0, 4, 4), torch.zeros(0, len(self.hand.joint_names))
+            return Grasps.build(pose.double(), joints.double(), len(self.hand.fingers))
         grasps = Grasps.cat(found).moved(inverse(level_T_camera))
         return select(self.hand, grasps, cloud, top_k, Selection(min_score=-math.inf), table_T_camera)
 
@@ -129,5 +132,13 @@ class MultiFinGan(Planner):
         score = networks.judge(judged, networks.judged(palm, joints))
         base = networks.base(palm).double()
         base[:, :3, 3] += middle
-        fingers, touching = len(self.hand.fingers), networks.types_touching[kind]
-        return Grasps.build(base, joints.double(), fingers, quality=score.double(), touching=touching)
+        touching, every = networks.types_touching[kind], torch.arange(self.samples)
+        grasps = Grasps.build(base, joints.double(), len(self.hand.fingers), quality=score.double(), touching=touching)
+        # One contact is told, so that reports know the object: the seen point that is nearest to a touching fingertip.
+        tips = (base.unsqueeze(1) @ self.hand.fingertips(grasps.joints))[..., :3, 3]
+        away, nearest = torch.cdist(tips, cloud[:, :3].double()).min(-1)
+        finger = torch.where(touching, away, math.inf).argmin(1)
+        grasps.contacts[every, finger], grasps.normals[every, finger] = (
+            part[nearest[every, finger]] for part in cloud.double().split(3, dim=1)
+        )
+        return grasps.replace(finger=finger)
