@@ -11,12 +11,25 @@ from dexgrasp import kernel_cache
 
 if TYPE_CHECKING:
     from dexgrasp import quality
+    from dexgrasp.arm import load_arm
     from dexgrasp.dataset.dataset import open_dataset
     from dexgrasp.model import load_model
+    from dexgrasp.motion import trajectory
     from dexgrasp.plugins import load_backbone, load_hand, load_representation
+    from dexgrasp.reachability import reachable
 
 __version__ = "0.1.0"
-__all__ = ["load_backbone", "load_hand", "load_model", "load_representation", "open_dataset", "quality"]
+__all__ = [
+    "load_arm",
+    "load_backbone",
+    "load_hand",
+    "load_model",
+    "load_representation",
+    "open_dataset",
+    "quality",
+    "reachable",
+    "trajectory",
+]
 
 kernel_cache.separate(Path(__file__).parent)
 
@@ -26,6 +39,9 @@ _HOMES = {
     "load_backbone": "dexgrasp.plugins",
     "load_model": "dexgrasp.model",
     "open_dataset": "dexgrasp.dataset.dataset",
+    "trajectory": "dexgrasp.motion",
+    "load_arm": "dexgrasp.arm",
+    "reachable": "dexgrasp.reachability",
 }
 
 

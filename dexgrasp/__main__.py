@@ -17,6 +17,7 @@ PIPELINES = {
     "fit": "teach a planner (a baseline that learns) on a dataset",
     "study": "compare methods under several rules, in tables: experiment=quick_benchmark",
     "predict": "grasps for one point cloud or depth image",
+    "export": "a trained network as ONNX or torch.export, checked; or as weights of the package: model=RUN [ship=NAME]",
     "fidelity": "how much of a grasp each representation keeps",
 }
 """Hydra apps: ``key=value`` overrides; config ``conf/<command>.yaml``."""

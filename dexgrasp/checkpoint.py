@@ -45,7 +45,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         with safe_open(path, framework="pt") as file:
             notes = json.loads((file.metadata() or {}).get("dexgrasp", "null"))
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118  not a mapping
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise DexgraspError(
             f"a whole safetensors file {path}",
             f"{path.stat().st_size} bytes that are none ({error})",
@@ -84,15 +84,17 @@ def _replace(path: Path, content: bytes) -> None:
 def find_checkpoint(name_or_path: str | Path) -> Path:
     """Return the file meant by a path, a training's folder or the name of shipped weights."""
     path = Path(name_or_path).expanduser()
+    shipped = {file.stem: file for file in sorted(WEIGHTS.glob("*.safetensors"))}
+    if str(name_or_path) in shipped and not (path.is_file() or (path / FILE).is_file()):
+        return shipped[str(name_or_path)]  # a folder that happens to be called so is not meant
     if path.is_dir():
         if not (path / FILE).is_file():
             raise DexgraspError(
                 f"{FILE} in the folder {path}", "no such file", "give the folder of a finished training"
             )
         return path / FILE
-    shipped = {file.stem: file for file in sorted(WEIGHTS.glob("*.safetensors"))}
-    if path.is_file() or str(name_or_path) in shipped:
-        return path if path.is_file() else shipped[str(name_or_path)]
+    if path.is_file():
+        return path
     close = difflib.get_close_matches(str(name_or_path), shipped, n=1)
     raise DexgraspError(
         f"a checkpoint's path, or shipped weights: {', '.join(shipped) or 'none are shipped'}",
@@ -128,7 +130,7 @@ def load_start(module: torch.nn.Module, hand: Hand, config: Mapping[str, Any], p
     check_hand(hand, notes["hand"], path)
     # A scorer judges the grasps of one network; the new one gets its own.
     tensors = {key: value for key, value in tensors.items() if not key.startswith("scorer.")}
-    trained, now = notes["config"], {key: _plain(config[key]) for key in ("repr", "backbone")}
+    trained, now = notes["config"], {key: plain(config[key]) for key in ("repr", "backbone")}
     other = [f"{kind}={trained[kind]['name']}" for kind in now if trained[kind]["name"] != now[kind]["name"]]
     differing = other or [
         f"{kind}.{key}={_word(value)}"
@@ -148,7 +150,8 @@ def load_start(module: torch.nn.Module, hand: Hand, config: Mapping[str, Any], p
     module.load_state_dict(tensors)
 
 
-def _plain(config: Any) -> Any:
+def plain(config: Any) -> Any:
+    """Return a config as JSON, with interpolations such as ${package:...} left as they are: no path of this machine."""
     return OmegaConf.to_container(config, resolve=False) if OmegaConf.is_config(config) else config
 
 

@@ -1,7 +1,5 @@
 """What one camera saw, from a file: a cloud, or a depth image with its intrinsics."""
 
-import io
-import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexgrasp.errors import DexgraspError
+from dexgrasp.sensing.arrays import load_npy, load_npz
 from dexgrasp.sensing.depth_image import KEY, metres, parse_png, unit_of
 from dexgrasp.sensing.intrinsics import Intrinsics, read_intrinsics
-from dexgrasp.sensing.limits import FILE, counted, sized
+from dexgrasp.sensing.limits import sized
 from dexgrasp.sensing.pcd import parse_pcd
 from dexgrasp.sensing.ply import parse_ply
 
@@ -92,16 +91,9 @@ def parse(
             factor = 1.0
         else:
             rows, shape, factor = _arrays(content, kind, scale, intrinsics, where)
-    except (ValueError, KeyError, IndexError, EOFError, OSError, TypeError, OverflowError, SyntaxError) as error:
-        raise _unreadable(kind, where, error) from error
-    except (
-        MemoryError,
-        zipfile.BadZipFile,
-        RecursionError,
-        AttributeError,
-        NotImplementedError,
-        RuntimeError,
-    ) as error:
+    except DexgraspError:
+        raise
+    except Exception as error:  # NumPy, Pillow and zipfile raise whatever they like for what is no such file
         raise _unreadable(kind, where, error) from error
     with np.errstate(over="ignore", invalid="ignore"):
         points = factor * rows[:, :3]
@@ -174,47 +166,3 @@ def _depth(
             "tell them: intrinsics=[fx,fy,cx,cy] or intrinsics=camera_info.yaml",
         )
     return intrinsics.points(depth), (depth.shape[0], depth.shape[1])
-
-
-def load_npy(content: bytes) -> NDArray[Any]:
-    """Return the array of a .npy file's content, numbers only; raises ValueError."""
-    file = io.BytesIO(content)
-    version = np.lib.format.read_magic(file)
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = header(file)
-    if dtype.kind not in "biuf":
-        raise ValueError(f"an array of {dtype}, not of numbers")
-    size = 1
-    for side in shape:
-        size *= int(side)
-    counted(size // 3, "the array")
-    if size * dtype.itemsize > len(content):
-        raise ValueError(f"{len(content)} bytes for an array of shape {shape} and type {dtype}")
-    file.seek(0)
-    return np.lib.format.read_array(file, allow_pickle=False)
-
-
-def load_npz(content: bytes) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a .npz file's content; raises ValueError where they unpack to more than the limit."""
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        members = [each for each in archive.infolist() if each.filename.endswith(".npy")]
-        if sum(each.file_size for each in members) > FILE:
-            raise ValueError(f"arrays of more than {FILE >> 20} MiB")
-        found = {}
-        for each in members:
-            with archive.open(each) as member:  # what the directory says of the size is not trusted
-                plain = member.read(min(each.file_size, FILE) + 1)
-            array = _one(plain)
-            if array is not None:
-                found[each.filename.removesuffix(".npy")] = array
-    return found
-
-
-def _one(content: bytes) -> NDArray[Any] | None:
-    """Return an array, None for one that holds no numbers: it is not asked for."""
-    try:
-        return load_npy(content)
-    except ValueError as error:
-        if "not of numbers" in str(error):
-            return None
-        raise

@@ -7,7 +7,7 @@ from numba import njit
 from torch import Tensor
 
 from dexgrasp.borrow import borrowed
-from dexgrasp.cloud_depth import cloud_depths
+from dexgrasp.cloud_depth import Blocks, cloud_depths, in_blocks
 from dexgrasp.distance import DistanceField, Field, quick_bound, seed_at
 from dexgrasp.hand import Hand
 from dexgrasp.hand_body import HandBody, carry, hand_body, place_links
@@ -98,14 +98,19 @@ class HandShape:
         return self._pairs
 
     def cloud_depth(
-        self, points: Float[Tensor, "P 3"], pose: Float[Tensor, "N 4 4"], joints: Float[Tensor, "N J"]
+        self,
+        points: Float[Tensor, "P 3"] | Blocks,
+        pose: Float[Tensor, "N 4 4"],
+        joints: Float[Tensor, "N J"],
+        enough: float = np.inf,
     ) -> Float[Tensor, "N"]:
         """Return how deep the deepest of the observed points lies in each hand (m), 0 where none does.
 
-        Points and `pose` share a frame. Exact for the convex parts: the distance to the nearest side of one of them.
+        Points and `pose` share a frame; who asks often about the same points gives `in_blocks(points)`. Exact for the
+        convex parts: the distance to the nearest side of one of them. Beyond `enough`, any value beyond will do.
         """
-        cloud = np.ascontiguousarray(points.detach().cpu().double().numpy())
-        return torch.from_numpy(cloud_depths(self.body, cloud, *as_arrays(pose, joints))).to(pose)
+        blocks = points if isinstance(points, Blocks) else in_blocks(points)
+        return torch.from_numpy(cloud_depths(self.body, blocks, *as_arrays(pose, joints), enough)).to(pose)
 
 
 def _cores(body: HandBody) -> np.ndarray:

@@ -36,9 +36,9 @@ def finger_direction(xy: Float[Tensor, "*b 2"], frame: Float[Tensor, "*b 3 3"]) 
     z = +sqrt(1 - x^2 - y^2): the outer joint lies on the outer side of the tangent plane. `xy` outside the unit
     disc is projected onto it.
     """
-    xy = to_disc(xy)
+    # z of the given numbers: of projected ones, it would be the root of their rounding error, 3e-4 and not 0.
     z = (1 - xy.square().sum(-1, keepdim=True)).clamp(min=0.0).sqrt()
-    return (frame @ torch.cat([xy, z], dim=-1).unsqueeze(-1)).squeeze(-1)
+    return (frame @ torch.cat([to_disc(xy), z], dim=-1).unsqueeze(-1)).squeeze(-1)
 
 
 def tip_rotation(u: Float[Tensor, "*b 3"], frame: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:

@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -39,15 +40,24 @@ class Finger:
     closing: Mapping[str, float]
     """Independent joints that close this finger and their rates (signed; 1 = towards the upper limit)."""
 
-    @property
+    @cached_property
     def reach(self) -> float:
         """Distance |v| from fingertip centre to outer joint, m."""
         return float(torch.linalg.vector_norm(self.outer_joint - self.tip_center))
 
-    @property
+    @cached_property
     def tip_axis(self) -> Float[Tensor, "3"]:
         """Unit vector u_l from fingertip centre to outer joint."""
         return (self.outer_joint - self.tip_center) / self.reach
+
+    @cached_property
+    def tip_frame(self) -> Float[Tensor, "4 4"]:
+        """link_T_tip, axes [u, w x u, w], origin at the fingertip circle's centre."""
+        frame = torch.eye(4, dtype=torch.float64)
+        u, w = self.tip_axis, self.closing_axis
+        frame[:3, :3] = torch.stack([u, torch.linalg.cross(w, u), w], dim=1)
+        frame[:3, 3] = self.tip_center
+        return frame
 
 
 class Hand(ABC):
@@ -86,7 +96,7 @@ class Hand(ABC):
         u points from the centre to the outer joint, w is the signed closing axis.
         """
         poses = self.link_poses(joints)
-        return torch.stack([poses[f.link] @ tip_frame(f).to(joints) for f in self.fingers], dim=1)
+        return torch.stack([poses[f.link] @ f.tip_frame.to(joints) for f in self.fingers], dim=1)
 
     def joint_index(self, names: tuple[str, ...]) -> list[int]:
         """Return the positions of named independent joints."""
@@ -96,12 +106,3 @@ class Hand(ABC):
         """Return joints brought within the limits."""
         limits = self.limits.to(joints)
         return joints.clamp(limits[:, 0], limits[:, 1])
-
-
-def tip_frame(finger: Finger) -> Float[Tensor, "4 4"]:
-    """Return link_T_tip of a finger, axes [u, w x u, w], origin at the fingertip circle's centre."""
-    frame = torch.eye(4, dtype=torch.float64)
-    u, w = finger.tip_axis, finger.closing_axis
-    frame[:3, :3] = torch.stack([u, torch.linalg.cross(w, u), w], dim=1)
-    frame[:3, 3] = finger.tip_center
-    return frame

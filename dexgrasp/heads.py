@@ -16,13 +16,41 @@ CERTAIN = 100.0
 """Logit of the true class in `as_prediction`: its probability is 1 in float32."""
 
 
+class Layers(nn.Sequential):
+    """Layers in a row. In evaluation, a linear layer and the batch norm behind it are one multiplication."""
+
+    def forward(self, rows: Float[Tensor, "N C"]) -> Float[Tensor, "N D"]:
+        if self.training:
+            return super().forward(rows)  # type: ignore[no-any-return]
+        layers = list(self)
+        for layer, following in zip(layers, [*layers[1:], None], strict=False):
+            if isinstance(layer, nn.Linear):
+                folded = (
+                    _folded(layer, following) if isinstance(following, nn.BatchNorm1d) else (layer.weight, layer.bias)
+                )
+                rows = F.linear(rows, *folded)
+            elif isinstance(layer, nn.ReLU):
+                rows = F.relu_(rows)  # behind a linear layer: its own memory
+            elif not isinstance(layer, nn.BatchNorm1d):
+                rows = layer(rows)
+        return rows
+
+
+def _folded(layer: nn.Linear, norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
+    """Return weight and bias of a linear layer and the batch norm behind it, with its running statistics."""
+    assert norm.running_mean is not None and norm.running_var is not None
+    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+    shift = norm.running_mean if layer.bias is None else norm.running_mean - layer.bias
+    return layer.weight * scale.unsqueeze(1), norm.bias - shift * scale
+
+
 def mlp(channels: int, hidden: Sequence[int], out: int) -> nn.Sequential:
     """Return linear, batch norm, ReLU per hidden layer and a linear layer on top (no bias under a batch norm)."""
     layers: list[nn.Module] = []
     for width in hidden:
         layers += [nn.Linear(channels, width, bias=False), nn.BatchNorm1d(width), nn.ReLU()]
         channels = width
-    return nn.Sequential(*layers, nn.Linear(channels, out))
+    return Layers(*layers, nn.Linear(channels, out))
 
 
 class Heads(nn.Module):
@@ -152,6 +180,11 @@ def finger_loss(
     weight = torch.where(classes == 0, none_weight, 1.0).to(log_p)
     loss = -log_p if focal == 0 else -log_p * (1 - log_p.exp()).clamp(min=1e-6).pow(focal)
     return (weight * loss).sum() / weight.sum().clamp(min=1e-6)
+
+
+def any_finger(logits: Float[Tensor, "N K"]) -> Float[Tensor, "N"]:
+    """Return the logit of the probability that a point is graspable, of the classes none and fingers."""
+    return logits[:, 1:].logsumexp(dim=-1) - logits[:, 0]
 
 
 def told_grasps(

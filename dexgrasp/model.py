@@ -16,6 +16,7 @@ from dexgrasp.checkpoint import (
     find_checkpoint,
     kinematics,
     load_state,
+    plain,
     read_tensors,
     replace_file,
     write_tensors,
@@ -92,29 +93,33 @@ class GraspNet(nn.Module):
         self.eval()
         one = None if plan is None else {key: row[None] for key, row in plan.items()}
         features, seeds = self._features(cloud[None], one)
-        rows, at = features[0], cloud[seeds[0]]
-        grasps = [self.representation.decode(at[:, :3], at[:, 3:], self.representation(rows))]
-        best = torch.arange(len(rows), device=rows.device)
-        if most is not None:
-            best = grasps[0].quality.argsort(descending=True, stable=True)[:most]
-        rows, at, grasps = rows[best], at[best], [grasps[0][best]]
-        for choice in range(1, min(choices, self.representation.choices)):
-            grasps.append(self.representation.decode(at[:, :3], at[:, 3:], self.representation(rows, choice=choice)))
+        rows, chosen = features[0], seeds[0]
+        if most is not None and most < len(rows):
+            best = self.representation.graspable(rows).topk(most).indices
+            rows, chosen = rows[best], chosen[best]
+        points, normals = cloud[chosen].split(3, dim=1)
+        grasps = [
+            self.representation.decode(points, normals, self.representation(rows, choice=choice))
+            for choice in range(max(1, min(choices, self.representation.choices)))
+        ]
         self.train(training)
-        return rows, seeds[0][best], grasps
+        return rows, chosen, grasps
 
     @torch.no_grad()
-    def propose(self, cloud: Float[Tensor, "N 6"], plan: Plan | None = None) -> Grasps:
+    def propose(
+        self, cloud: Float[Tensor, "N 6"], plan: Plan | None = None, coarse: Int[Tensor, "Q"] | None = None
+    ) -> Grasps:
         """Return grasps at the seeds of one cloud, unsorted and unchecked; `quality` is the score. Level frame.
 
-        One per seed, or as many as the scorer is used to choosing from.
+        One per seed, or as many as the scorer is used to choosing from. `plan` and `coarse` (rows of `coarse_points`,
+        for a scorer) are found here where None.
         """
         if self.scorer is None:
             return self.told(cloud, plan)[2][0]
         scorer = self.scorer.eval()
         features, seeds, grasps = self.told(cloud, plan, scorer.choices, scorer.most)
-        at, coarse = cloud[seeds], coarse_points(cloud)
-        logits = [scorer(features, at, told, surroundings(self.hand, told, coarse)) for told in grasps]
+        at, spread = cloud[seeds], coarse_points(cloud) if coarse is None else cloud[coarse]
+        logits = [scorer(features, at, told, surroundings(self.hand, told, spread)) for told in grasps]
         return Grasps.cat([told.replace(quality=logit.sigmoid()) for told, logit in zip(grasps, logits, strict=True)])
 
     def predict(
@@ -163,7 +168,7 @@ def save_model(path: Path, model: GraspNet, facts: Mapping[str, Any] | None = No
     notes = {
         "kind": "model",
         "scorer": None if model.scorer is None else model.scorer.options,
-        "config": {key: _plain(value) for key, value in model.config.items()},
+        "config": {key: plain(value) for key, value in model.config.items()},
         "points": model.points,
         "hand": kinematics(model.hand),
         "facts": dict(facts or {}),
@@ -193,10 +198,3 @@ def load_model(name_or_path: str | Path, hand: Hand | None = None, device: str |
         model.scorer = Scorer(model.hand, model.backbone.channels, **notes["scorer"])
     load_state(model, tensors, path)
     return model.to(device).eval()
-
-
-def _plain(config: Any) -> Any:
-    """Return a config as JSON, with interpolations such as ${package:...} left as they are: no path of this machine."""
-    from omegaconf import DictConfig, ListConfig, OmegaConf
-
-    return OmegaConf.to_container(config, resolve=False) if isinstance(config, DictConfig | ListConfig) else config

@@ -31,6 +31,8 @@ CLOSER, OPENER, STEPS = 0.25, 0.5, 26
 """Fingers are closed on what was seen: so far beyond and before the predicted joints (rad or m), in so many steps."""
 TOUCH = 0.001
 """Depth (m) of an observed point in the hand that is a contact."""
+BEHIND = 0.06
+"""Farthest that a finger which touches may end from what was seen of its object, m: the far side is not seen."""
 PAD = 0.008
 """Farthest that a point may be from the fingertip's surface to be its contact, m."""
 
@@ -90,7 +92,7 @@ def predict_sight(
     shape = HandShape(model.hand)
     depth = shape.cloud_depth(cloud[near, :3], closed.pose.double(), closed.joints.double())
     good = depth <= (chosen.depth if chosen.depth is not None else torch.inf)
-    good &= closed.contacts.isfinite().any(-1).any(-1)
+    good &= _at_object(model.hand, closed, sight)
     if table is not None and chosen.table is not None:
         good &= shape.table_distance(table @ closed.pose.double(), closed.joints.double()) >= -chosen.table
     closed = closed[good][:top_k]
@@ -123,6 +125,21 @@ def _owned(hand: Hand, grasps: Grasps, sight: Sight) -> Grasps:
 
 def _tips(hand: Hand, pose: Float[Tensor, "N 4 4"], joints: Float[Tensor, "N J"]) -> Float[Tensor, "N F 3"]:
     return (pose[:, None] @ hand.fingertips(joints))[..., :3, 3]
+
+
+def _at_object(hand: Hand, grasps: Grasps, sight: Sight) -> Tensor:
+    """Tell which grasps touch what was seen, with no finger that touches far from their object."""
+    tips = _tips(hand, grasps.pose.double(), grasps.joints.double())
+    good = torch.ones(len(grasps), dtype=torch.bool)
+    radii = torch.tensor([finger.tip_radius for finger in hand.fingers], dtype=torch.float64)
+    for number in torch.unique(grasps.object).tolist():
+        rows = grasps.object == number
+        tree = cKDTree(sight.points[sight.labels == number])
+        gaps = torch.from_numpy(tree.query(tips[rows].numpy())[0])
+        touching = grasps.touching[rows]
+        near = ((gaps < BEHIND) | ~touching).all(dim=1)
+        good[rows] &= near & ((gaps - radii < PAD) & touching).any(dim=1)
+    return good
 
 
 def _beside(level: Float[Tensor, "P 6"], labels: NDArray[np.int64], reach: float = 0.35) -> Tensor:

@@ -78,6 +78,15 @@ class Representation(nn.Module, ABC):
         build on the true ones there (teacher forcing). Without it, they build on their own.
         """
 
+    def graspable(self, features: Float[Tensor, "N C"]) -> Float[Tensor, "N"]:
+        """Return, for each point, a number that grows with the score that `decode` gives; cheaper where one head tells.
+
+        Where the score depends on where a point lies, a representation has to say this itself.
+        """
+        points = features.new_zeros(len(features), 3)
+        normals = points + points.new_tensor([0.0, 0.0, 1.0])
+        return self.decode(points, normals, self(features)).quality
+
     @abstractmethod
     def loss(self, prediction: Prediction, targets: Targets) -> dict[str, Tensor]:
         """Return the loss terms by name, weighted, each a scalar; their sum is minimised."""

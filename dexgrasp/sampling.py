@@ -21,7 +21,7 @@ def farthest_points(points: Float[Tensor, "N 3"], count: int) -> Int[Tensor, "co
     then z. More points than there are repeat the first in that order.
     """
     xyz = np.ascontiguousarray(points.detach().cpu().numpy(), dtype=np.float32)
-    order = np.argsort(_morton(xyz), kind="stable")
+    order = np.argsort(morton(xyz), kind="stable")
     return torch.from_numpy(order[_farthest(xyz[order], count)])
 
 
@@ -69,7 +69,7 @@ def _squared(vectors: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
     return x * x + y * y + z * z  # the kernel's order of operations, bit by bit
 
 
-def _morton(xyz: np.ndarray) -> np.ndarray:
+def morton(xyz: np.ndarray) -> np.ndarray:
     """Return the position of each point along a space-filling curve (Morton 1966), 10 bits an axis."""
     low = xyz.min(axis=0)
     extent = max(float((xyz.max(axis=0) - low).max()), 1e-9)

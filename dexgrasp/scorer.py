@@ -3,8 +3,10 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numba import njit
 from torch import Tensor, nn
 
 from dexgrasp.geometry import transform
@@ -15,6 +17,8 @@ from dexgrasp.sampling import farthest_points
 
 COARSE, NEAREST = 512, 64
 """Of so many points, spread evenly over the scene, a grasp is judged by the ones nearest to the middle of its tips."""
+PIECE = 32
+"""Hands whose surroundings are looked at together in evaluation."""
 REACH = 0.1
 """Offsets and heights (m) in units of this are numbers of order one."""
 
@@ -64,7 +68,9 @@ class Scorer(nn.Module):
         """Return N logits; `at` is point (m) and normal where each grasp is told, level frame; `around` see below."""
         offset = (grasps.pose[:, :3, 3] - at[:, :3]) / REACH
         turned = grasps.pose[:, :3, :2].flatten(1)
-        near = self.around(around.to(features).flatten(0, 1)).unflatten(0, around.shape[:2]).amax(dim=1)
+        whole = self.training or torch.compiler.is_compiling()
+        pieces = around.to(features).split(len(around) if whole else PIECE)  # that stay in the cache
+        near = torch.cat([self.around(part.flatten(0, 1)).unflatten(0, part.shape[:2]).amax(dim=1) for part in pieces])
         seen = [features, near, offset, turned, at[:, 3:], at[:, 2:3] / REACH, grasps.joints]
         return self.layers(torch.cat([part.to(features) for part in seen], dim=1)).squeeze(1)
 
@@ -75,11 +81,75 @@ def coarse_points(cloud: Float[Tensor, "N 6"], count: int = COARSE) -> Float[Ten
 
 
 def surroundings(hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"]) -> Float[Tensor, "N K 7"]:
-    """Return the `points` about each hand: position and normal in its palm's frame, height in the level one; scaled."""
+    """Return the `points` about each hand: position and normal in its palm's frame, height in the level one; scaled.
+
+    The K nearest to the middle of its tips, in no particular order.
+    """
     points = points.to(grasps.pose)
     middle = transform(grasps.pose, hand.fingertips(grasps.joints)[..., :3, 3].mean(dim=1).to(grasps.pose))
-    nearest = torch.cdist(middle, points[:, :3]).topk(min(NEAREST, len(points)), largest=False).indices
-    positions, normals = points[nearest].split(3, dim=-1)
     palm = grasps.pose @ hand.base_T_palm.to(grasps.pose)
+    count = min(NEAREST, len(points))
+    compiled = palm.device.type == "cpu" and palm.dtype == torch.float32 and not torch.compiler.is_compiling()
+    return (_compiled if compiled and not palm.requires_grad else around_reference)(middle, palm, points, count)
+
+
+def around_reference(
+    middle: Float[Tensor, "N 3"], palm: Float[Tensor, "N 4 4"], points: Float[Tensor, "Q 6"], count: int
+) -> Float[Tensor, "N K 7"]:
+    """Return the `count` points nearest to each `middle`, in the palm's frame and scaled, in plain torch."""
+    apart = middle[:, None] - points[:, :3]
+    nearest = apart.square().sum(dim=-1).topk(count, largest=False).indices
+    positions, normals = points[nearest].split(3, dim=-1)
     local = (positions - palm[:, None, :3, 3]) @ palm[:, :3, :3] / REACH
     return torch.cat([local, normals @ palm[:, :3, :3], positions[..., 2:] / REACH], dim=-1)
+
+
+def _compiled(
+    middle: Float[Tensor, "N 3"], palm: Float[Tensor, "N 4 4"], points: Float[Tensor, "Q 6"], count: int
+) -> Float[Tensor, "N K 7"]:
+    out = torch.empty(len(middle), count, 7)
+    one, other, third = (part.detach().contiguous().numpy() for part in (middle, palm, points))
+    _around(one, other, third, np.float32(1 / REACH), out.numpy())
+    return out
+
+
+@njit(cache=True)
+def _around(middle: np.ndarray, palm: np.ndarray, points: np.ndarray, scale: np.float32, out: np.ndarray) -> None:
+    count, total = out.shape[1], len(points)
+    x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
+    apart = np.empty(total, np.float32)
+    for i in range(len(middle)):
+        a, b, c = middle[i]
+        for k in range(total):
+            u, v, w = x[k] - a, y[k] - b, z[k] - c
+            apart[k] = u * u + v * v + w * w
+        # The limit within which `count` lie, by bisection: counting is quick, and a few steps are enough.
+        below, limit = np.float32(-1), apart.max()
+        while True:
+            middle_way = np.float32((below + limit) / 2)
+            if middle_way <= below or middle_way >= limit:
+                break
+            inside = 0
+            for k in range(total):
+                inside += apart[k] <= middle_way
+            if inside < count:
+                below = middle_way
+            else:
+                limit = middle_way
+            if inside == count:
+                break
+        room = count  # for points at the very limit: as many as nearer ones leave
+        for k in range(total):
+            room -= apart[k] < limit
+        r, n = palm[i], 0
+        for k in range(total):
+            if apart[k] > limit or (apart[k] == limit and room == 0):
+                continue
+            room -= apart[k] == limit
+            u, v, w = x[k] - r[0, 3], y[k] - r[1, 3], z[k] - r[2, 3]
+            p, q, s = points[k, 3], points[k, 4], points[k, 5]
+            for axis in range(3):
+                out[i, n, axis] = (u * r[0, axis] + v * r[1, axis] + w * r[2, axis]) * scale
+                out[i, n, 3 + axis] = p * r[0, axis] + q * r[1, axis] + s * r[2, axis]
+            out[i, n, 6] = z[k] * scale
+            n += 1

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dexgrasp.cloud_depth import Blocks, in_blocks
 from dexgrasp.execution import pregrasp
 from dexgrasp.geometry import rotation_angle
 from dexgrasp.grasps import Grasps
@@ -60,17 +61,20 @@ def select(
     grasps = grasps[order]
     shape = _shape(hand) if selection.depth is not None or selection.table is not None else None
     table = table_T_camera if selection.table is not None else None
+    points = in_blocks(cloud[:, :3])
     kept: list[int] = []
     for start, stop in _chunks(len(grasps), top_k):
         if len(kept) >= top_k:
             break
-        fresh = [row for row in range(start, stop) if not _alike(grasps, row, kept, selection)]
-        if shape is not None and fresh:
-            passed = free(hand, shape, grasps[fresh], cloud[:, :3], table, selection)
-            fresh = [row for row, good in zip(fresh, passed.tolist(), strict=True) if good]
-        for row in fresh:
-            if len(kept) < top_k and not _alike(grasps, row, kept, selection):
-                kept.append(row)
+        fresh = torch.arange(start, stop)
+        fresh = fresh[~_alike(grasps[fresh], grasps[kept], selection).any(dim=1)]
+        if shape is not None and len(fresh):
+            fresh = fresh[free(hand, shape, grasps[fresh], points, table, selection)]
+        like, chosen = _alike(grasps[fresh], grasps[fresh], selection).numpy(), list[int]()
+        for row in range(len(fresh)):
+            if len(kept) + len(chosen) < top_k and not like[row, chosen].any():
+                chosen.append(row)
+        kept += fresh[chosen].tolist()
     return grasps[kept]
 
 
@@ -78,7 +82,7 @@ def free(
     hand: Hand,
     shape: Any,
     grasps: Grasps,
-    points: Float[Tensor, "P 3"],
+    points: Float[Tensor, "P 3"] | Blocks,
     table: Float[Tensor, "4 4"] | None,
     selection: Selection,
 ) -> Bool[Tensor, "N"]:
@@ -88,6 +92,7 @@ def free(
     the table must be clear of the closed posture too. `shape` is the hand's `HandShape`, `table` is table_T_camera.
     """
     passed = torch.ones(len(grasps), dtype=torch.bool)
+    points = points if isinstance(points, Blocks) else in_blocks(points)
     if table is not None and selection.table is not None:
         motion = table.to(grasps.pose)
         passed &= torch.as_tensor(shape.table_distance(motion @ grasps.pose, grasps.joints)) >= -selection.table
@@ -102,7 +107,8 @@ def free(
             good &= torch.as_tensor(shape.table_distance(motion @ pose, joints)) >= -selection.table
         if selection.depth is not None and good.any():
             rows = good.nonzero().flatten()
-            good[rows] = torch.as_tensor(shape.cloud_depth(points, pose[rows], joints[rows])) <= selection.depth
+            depth = shape.cloud_depth(points, pose[rows], joints[rows], enough=selection.depth)
+            good[rows] = torch.as_tensor(depth) <= selection.depth
         passed[alive] = good
     return passed
 
@@ -115,12 +121,14 @@ def _chunks(total: int, top_k: int) -> Iterator[tuple[int, int]]:
         start, size = start + size, min(2 * size, 256)
 
 
-def _alike(grasps: Grasps, row: int, kept: list[int], selection: Selection) -> bool:
-    if not kept:
-        return False
-    near = torch.linalg.vector_norm(grasps.pose[kept, :3, 3] - grasps.pose[row, :3, 3], dim=1) < selection.distance
-    turned = rotation_angle(grasps.pose[kept, :3, :3], grasps.pose[row, :3, :3]) < selection.angle
-    return bool((near & turned).any())
+def _alike(grasps: Grasps, others: Grasps, selection: Selection) -> Bool[Tensor, "N M"]:
+    """Return which of the grasps are nearly the same as which of the others."""
+    gap = grasps.pose[:, None, :3, 3] - others.pose[None, :, :3, 3]
+    alike = torch.linalg.vector_norm(gap, dim=-1) < selection.distance
+    row, other = alike.nonzero().unbind(1)
+    turned = rotation_angle(grasps.pose[row, :3, :3], others.pose[other, :3, :3])
+    alike[row, other] = turned < selection.angle
+    return alike
 
 
 @lru_cache(maxsize=4)

@@ -15,6 +15,7 @@ from dexgrasp.heads import (
     CERTAIN,
     Heads,
     JointBins,
+    any_finger,
     contact_points,
     every_finger,
     finger_loss,
@@ -234,6 +235,10 @@ class StagedContact(Representation):
             name: value.new_zeros(len(features), *value.shape[1:]).index_copy(0, rows, value)
             for name, value in told.items()
         }
+
+    def graspable(self, features: Float[Tensor, "N C"]) -> Float[Tensor, "N"]:
+        """Return the logit of the score, from the first head alone."""
+        return any_finger(self.stages["finger"](features)["finger"])
 
     def _tell(
         self, features: Float[Tensor, "N C"], classes: Float[Tensor, "N K"], truth: Targets | None, choice: int = 0

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dexgrasp.geometry import inverse
-from dexgrasp.hand import Finger, Hand, tip_frame
+from dexgrasp.hand import Finger, Hand
 
 REACH = 1.25
 """The fingertip reaches so many radii about the circle's centre, seen along the closing axis; as in closing."""
@@ -53,7 +53,7 @@ class TipSurface:
 
 def _surface(hand: Hand, finger: Finger) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "S 3"]]:
     """Return corners and drawn points of a fingertip in the tip frame; none where its link has no parts."""
-    tip_T_link = inverse(tip_frame(finger)).numpy()
+    tip_T_link = inverse(finger.tip_frame).numpy()
     reach, turn = REACH * finger.tip_radius, np.arange(SIDES) * 2 * np.pi / SIDES
     outward = np.stack([np.cos(turn), np.sin(turn), np.zeros(SIDES)], axis=1)
     parts = []

@@ -16,7 +16,7 @@ import dexgrasp
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/*/pyproject.toml"))
-KINDS = {"hands": "hand", "representations": "repr", "backbones": "backbone"}
+KINDS = {"hands": "hand", "representations": "repr", "backbones": "backbone", "planners": "planner"}
 
 
 def build(source, target, kind):

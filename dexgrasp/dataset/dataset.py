@@ -74,12 +74,15 @@ class Dataset:
         try:
             content = json.loads(file.read_text())
             schema = content["schema"]
-        except (ValueError, KeyError, TypeError) as cause:
-            raise DexgraspError(f"a description of a dataset in {file}", str(cause), "make it again") from cause
+            stages = {str(stage): str(name) for stage, name in content["stages"].items()} if schema == SCHEMA else {}
+            config, hand, told = (content.get(key) for key in ("config", "hand", "representation"))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as cause:
+            found = f"{type(cause).__name__}: {cause}"
+            raise DexgraspError(f"a description of a dataset in {file}", found, "make it again") from cause
         if schema != SCHEMA:
             raise DexgraspError(f"schema {SCHEMA} in {file}", f"schema {schema}", "make it again with this version")
-        folders = {stage: Path(os.path.normpath(file.parent / name)) for stage, name in content["stages"].items()}
-        return cls(content["config"], content["hand"], folders, content["representation"])
+        folders = {stage: Path(os.path.normpath(file.parent / name)) for stage, name in stages.items()}
+        return cls(config, hand, folders, told)
 
     def save(self, path: Path) -> Path:
         """Write the description by which `open` finds the stages, and return its path."""

@@ -14,8 +14,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from dexgrasp.borrow import borrowed
+from dexgrasp.cells import BITS, Cells, find_cell, make_cells
+
 FEWEST = 10
 """Points of a loose cloud that are used however far they are: where a cloud is thin, one radius holds too few."""
+SPARSE, WIDER = 10, 1.7
+"""Where cells of one radius hold fewer points than this, so much larger ones are looked through."""
 RADIUS = 0.010
 """Neighbourhood (m): about 2 deg of noise for 1 mm of depth noise at 1 mm a pixel, and still inside a 2 cm part."""
 
@@ -39,11 +44,14 @@ def estimate_normals(
         return torch.zeros_like(points)
     k = max(min(k, len(cloud)), 2)
     rows = np.arange(len(cloud)) if at is None else np.asarray(at, dtype=np.int64)
-    distances, neighbours = cKDTree(cloud).query(cloud[rows], k=k)
-    far = distances > radius
-    far[:, :FEWEST] = False
-    neighbours[far] = len(cloud)
-    return torch.from_numpy(_fit_neighbours(cloud, rows, neighbours, eye)).to(points)
+    cells = make_cells(cloud, radius)
+    if cells.occupied * SPARSE > len(cloud):
+        cells = make_cells(cloud, WIDER * radius)
+    normals, lonely = _fit_near(cells, cloud, rows, k, min(FEWEST, k), radius, eye)
+    if len(lonely):
+        neighbours = cKDTree(cloud).query(cloud[rows[lonely]], k=min(FEWEST, k))[1]
+        normals[lonely] = _fit_neighbours(cloud, rows[lonely], neighbours, eye)
+    return torch.from_numpy(normals).to(points)
 
 
 def depth_normals(
@@ -63,6 +71,56 @@ def depth_normals(
 
 
 @numba.njit(cache=True)
+def _fit_near(
+    cells: Cells, cloud: NDArray, rows: NDArray, most: int, fewest: int, radius: float, eye: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Fit the `most` nearest points within the radius, or the `fewest` nearest where there are fewer.
+
+    Return the normals, and for which of the rows even the surrounding cells hold too few.
+    """
+    cells, cloud, rows = borrowed(cells), borrowed(cloud), borrowed(rows)
+    keys, starts, stops, low, side = cells.keys, cells.starts, cells.stops, cells.low, cells.side
+    px, py, pz = cells.points
+    normals, lonely, alone = np.zeros((len(rows), 3)), np.empty(len(rows), np.int64), 0
+    near, index = np.empty(len(px)), np.empty(len(px), np.int64)
+    sums = np.empty(9)
+    for m in range(len(rows)):
+        x, y, z = cloud[rows[m]]
+        i, j, k = int((x - low[0]) / side) + 1, int((y - low[1]) / side) + 1, int((z - low[2]) / side) + 1
+        count, inside = 0, 0
+        for a in range(i - 1, i + 2):
+            for b in range(j - 1, j + 2):
+                for c in range(k - 1, k + 2):
+                    key = (a << 2 * BITS) | (b << BITS) | c
+                    slot = find_cell(keys, key)
+                    if keys[slot] == key:
+                        start = starts[slot]
+                        for n in range(stops[slot] - start):
+                            u, v, w = px[start + n] - x, py[start + n] - y, pz[start + n] - z
+                            near[count + n], index[count + n] = u * u + v * v + w * w, start + n
+                        count += stops[slot] - start
+        limit = radius * radius
+        for n in range(count):
+            inside += near[n] <= limit
+        if inside > most:
+            limit = min(limit, np.partition(near[:count], most - 1)[most - 1])
+        elif inside < fewest:
+            limit = np.partition(near[:count], fewest - 1)[fewest - 1] if count >= fewest else np.inf
+            if limit > side * side:  # something nearer may lie in other cells
+                lonely[alone] = m
+                alone += 1
+                continue
+        sums[:] = 0.0
+        taken = 0
+        for n in range(count):
+            if near[n] <= limit:
+                _add(sums, px[index[n]] - x, py[index[n]] - y, pz[index[n]] - z)
+                taken += 1
+        _plane(sums, taken, eye[0] - x, eye[1] - y, eye[2] - z, normals[m])
+    return normals, lonely[:alone]
+
+
+@numba.njit(cache=True)
 def _fit_neighbours(cloud: NDArray, rows: NDArray, neighbours: NDArray, eye: NDArray) -> NDArray:
     normals = np.empty((len(rows), 3))
     sums = np.empty(9)
@@ -71,9 +129,8 @@ def _fit_neighbours(cloud: NDArray, rows: NDArray, neighbours: NDArray, eye: NDA
         sums[:] = 0.0
         count = 0
         for j in neighbours[m]:
-            if j < len(cloud):
-                _add(sums, cloud[j, 0] - cloud[i, 0], cloud[j, 1] - cloud[i, 1], cloud[j, 2] - cloud[i, 2])
-                count += 1
+            _add(sums, cloud[j, 0] - cloud[i, 0], cloud[j, 1] - cloud[i, 1], cloud[j, 2] - cloud[i, 2])
+            count += 1
         _plane(sums, count, eye[0] - cloud[i, 0], eye[1] - cloud[i, 1], eye[2] - cloud[i, 2], normals[m])
     return normals
 

@@ -26,7 +26,7 @@ from dexgrasp.hand import Hand
 from dexgrasp.objects import load_objects
 from dexgrasp.plugins import build_hand, build_representation, load_class
 
-REVISION = 8
+REVISION = 9
 """Part of every hash; raised when code changes what the same settings give."""
 STAGES = ("objects", "grasps", "verdicts", "scenes", "views", "labels")
 

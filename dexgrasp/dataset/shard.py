@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import resource
 import tarfile
 import time
@@ -17,6 +18,9 @@ from torch import Tensor
 
 from dexgrasp.dataset.temporary import temporary
 from dexgrasp.errors import room
+
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
+"""Of files in a store: nothing that leads out of it."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +48,18 @@ class Shard:
 
     @classmethod
     def read(cls, record: Mapping[str, Any]) -> "Shard":
-        """Return the shard of a record as JSON gives it."""
-        return cls(**{**record, "items": tuple(map(tuple, record["items"]))})
+        """Return the shard of a record as JSON gives it; raises ValueError, TypeError or KeyError for none.
+
+        Its file lies in the store's own folder, and its items lie in the file.
+        """
+        shard = cls(**{**record, "items": tuple(map(tuple, record["items"]))})
+        if not isinstance(shard.file, str) or not NAME.fullmatch(shard.file) or not isinstance(shard.bytes, int):
+            raise ValueError(f"a shard in {str(shard.file)[:100]!r}")
+        for name, *places in shard.items:
+            inside = len(places) == 4 and all(isinstance(each, int) and each >= 0 for each in places)
+            if not (inside and isinstance(name, str) and max(sum(places[:2]), sum(places[2:])) <= shard.bytes):
+                raise ValueError(f"an item {str(name)[:100]!r} that is not inside {shard.file}")
+        return shard
 
     @property
     def record(self) -> str:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import safetensors.torch
+from safetensors import SafetensorError
 
 from dexgrasp.dataset.claims import lock
 from dexgrasp.dataset.shard import Item, Shard, shard_name, write_shard, write_whole
@@ -24,6 +25,8 @@ from dexgrasp.errors import DexgraspError
 
 SCHEMA = 2
 MANIFEST = "manifest.json"
+MOST = 10_000_000
+"""Shards of a store."""
 log = logging.getLogger(__name__)
 
 
@@ -79,11 +82,13 @@ class Store:
         try:
             manifest = json.loads(path.read_text())
             schema = manifest["schema"]
+            if schema == SCHEMA:
+                _sound(manifest)
         except FileNotFoundError:
             raise DexgraspError(
                 f"a store with a {MANIFEST}", f"none in {folder}", "run `python -m dexgrasp dataset`"
             ) from None
-        except (ValueError, KeyError, TypeError) as cause:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as cause:
             remedy = f"delete {folder} and run again: it is made again"
             raise DexgraspError(f"a readable manifest {path}", str(cause), remedy) from cause
         if schema != SCHEMA:
@@ -163,7 +168,11 @@ class Store:
         with open(self.folder / shard.file, "rb", buffering=0) as file:
             tensors = os.pread(file.fileno(), size, start)
             facts = os.pread(file.fileno(), facts_size, facts_start)
-        return Item(name, safetensors.torch.load(tensors), json.loads(facts))
+        try:
+            return Item(name, safetensors.torch.load(tensors), json.loads(facts))
+        except (SafetensorError, ValueError, KeyError, RuntimeError) as cause:
+            found, remedy = f"{type(cause).__name__}: {cause}", "get the data from who made them, or make them again"
+            raise DexgraspError(f"item {name} in {self.folder / shard.file}", found, remedy) from cause
 
     def facts(self) -> Iterator[Mapping[str, Any]]:
         """Read the JSON part of every item, without its tensors."""
@@ -202,6 +211,15 @@ class Store:
         self.manifest["shards"] = {str(i): asdict(shard) for i, shard in sorted(self._shards.items())}
         self.manifest["count"] = len(self._index)
         write_whole(self.folder / MANIFEST, json.dumps(self.manifest, indent=1, default=str).encode())
+
+
+def _sound(manifest: Mapping[str, Any]) -> None:
+    """Raise ValueError, TypeError or KeyError where a manifest is none."""
+    if not isinstance(manifest["expected_shards"], int) or not 0 <= manifest["expected_shards"] <= MOST:
+        raise ValueError(f"expected_shards {manifest['expected_shards']!r:.50}")
+    for index, record in manifest["shards"].items():
+        int(index)
+        Shard.read(record)
 
 
 def recorded(folder: Path, index: int) -> Shard | None:

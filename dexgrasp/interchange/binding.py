@@ -13,6 +13,8 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.interchange.grasp_set import Array, GraspSet, Posture, posed, quaternions
+from dexgrasp.sensing.limits import TEXT, sized
+from dexgrasp.sensing.plain_yaml import read_yaml
 from dexgrasp.settings import read
 
 BEYOND = 0.02
@@ -40,8 +42,8 @@ def load_mapping(path: str | Path | None) -> Description:
     if path is None:
         return Description()
     try:
-        content = yaml.safe_load(Path(path).read_text())
-    except (OSError, yaml.YAMLError) as error:
+        content = read_yaml(sized(Path(path), TEXT).read_text())
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         raise DexgraspError(f"a YAML file {path}", str(error), "check the path") from error
     if not isinstance(content, dict):
         raise DexgraspError(f"a mapping in {path}", type(content).__name__, "see docs/interchange.md")

@@ -14,6 +14,7 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.interchange.format import Format, Told
 from dexgrasp.interchange.grasp_set import Array, GraspSet, Posture, posed, quaternions, wxyz
 from dexgrasp.interchange.pickled import read_npy
+from dexgrasp.sensing.limits import GRASPS, head
 
 STAGES = {"grasp": "grasp_qpos", "pregrasp": "pregrasp_qpos", "squeeze": "squeeze_qpos"}
 FINGERS = {"FF": "4321", "MF": "4321", "RF": "4321", "LF": "54321", "TH": "54321"}
@@ -33,7 +34,7 @@ class DexGraspBench(Format):
     def recognises(self, path: Path) -> bool:
         """One file is enough of a folder."""
         files = _files(path)
-        return bool(files) and b"grasp_qpos" in files[0].read_bytes()
+        return bool(files) and b"grasp_qpos" in head(files[0], GRASPS)
 
     def read(self, path: Path, told: Told) -> GraspSet:
         """Joint names are the file's `joint_names`, or those told, or for 22 and 16 joints the benchmark's hands'."""
@@ -133,7 +134,7 @@ def _read(file: Path, told: Told) -> tuple[tuple[str, ...], dict[str, Array], Ar
 def _table(value: Any, file: Path, key: str) -> Array:
     try:
         table = np.atleast_2d(np.asarray(value, dtype=np.float64))
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise DexgraspError(f"numbers in {key} of {file}", str(error), "mend the file") from error
     if table.ndim != 2 or table.shape[1] < 7:
         raise DexgraspError(f"rows of 7 numbers and joints in {key} of {file}", str(table.shape), "mend the file")

@@ -14,6 +14,7 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.interchange.format import Format, Told
 from dexgrasp.interchange.grasp_set import GraspSet, Posture, posed
 from dexgrasp.interchange.pickled import read_npy
+from dexgrasp.sensing.limits import GRASPS, head, sized
 
 PLACE = ("WRJTx", "WRJTy", "WRJTz")
 TURN = ("WRJRx", "WRJRy", "WRJRz")
@@ -33,8 +34,8 @@ class DexGraspNet(Format):
         """JSON or a pickled list whose beginning speaks of qpos."""
         if not path.is_file() or path.suffix not in (".json", ".npy"):
             return False
-        start = path.read_bytes()[:600]
-        return b"qpos" in start and (b"WRJ" in path.read_bytes()[:4000]) and b"grasp_qpos" not in start
+        start = head(path, 4000)
+        return b"qpos" in start[:600] and b"WRJ" in start and b"grasp_qpos" not in start[:600]
 
     def read(self, path: Path, told: Told) -> GraspSet:
         """Joint names are those of a published hand, or those told."""
@@ -61,8 +62,8 @@ class DexGraspNet(Format):
 
 def _entries(path: Path) -> list[Any]:
     try:
-        content = json.loads(path.read_text()) if path.suffix == ".json" else read_npy(path)
-    except (ValueError, OSError) as error:
+        content = json.loads(sized(path, GRASPS).read_text()) if path.suffix == ".json" else read_npy(path)
+    except (ValueError, OSError, RecursionError) as error:
         raise DexgraspError(
             f"grasps of DexGraspNet in {path}", f"{type(error).__name__}: {error}", "mend it"
         ) from error
@@ -88,7 +89,7 @@ def _numbers(entry: Any, names: tuple[str, ...], path: Path, row: int) -> list[f
         raise DexgraspError(f"joints {', '.join(names)} and WRJ* of grasp {row} in {path}", found, remedy)
     try:
         return [float(qpos[name]) for name in wanted]
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise DexgraspError(f"numbers in grasp {row} of {path}", str(error), "mend the file") from error
 
 

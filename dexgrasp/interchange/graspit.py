@@ -14,12 +14,14 @@ import numpy as np
 from dexgrasp.errors import DexgraspError
 from dexgrasp.interchange.format import Format, Told
 from dexgrasp.interchange.grasp_set import Array, GraspSet, Posture, posed, quaternions
+from dexgrasp.sensing.limits import GRASPS, head, sized
 
 MILLIMETRE = 0.001
 BREAKAWAY = {"Barrett": (0, 2, 2, 2), "BarrettBH8_280": (0, 2, 2, 2)}
 """Robots whose degrees of freedom break away, and how many joints each of those moves; 0: it does not."""
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-TRANSFORM = re.compile(rf"\(\s*((?:{NUMBER}\s*){{4}})\)\s*\[\s*((?:{NUMBER}\s*){{3}})\]")
+TRANSFORM = re.compile(r"\(([^()\[\]]*)\)\s*\[([^()\[\]]*)\]")
+"""Loose, so that it is quick on whatever it meets; the numbers are looked at one by one."""
 
 
 class GraspIt(Format):
@@ -63,12 +65,12 @@ class GraspIt(Format):
 def _worlds(path: Path) -> list[Path]:
     files = sorted(path.rglob("*.xml")) if path.is_dir() else [path]
     files = [file for file in files if file.is_file() and file.suffix in (".xml", ".wld")]
-    return [file for file in files if b"<world" in (text := file.read_bytes()) and b"dofValues" in text]
+    return [file for file in files if b"<world" in (text := head(file, GRASPS)) and b"dofValues" in text]
 
 
 def _world(file: Path) -> tuple[str, list[float], Array, Array, str]:
     """Return the robot, its dofValues, world_T_base and world_T_object (1, 4, 4), and the object's name."""
-    text = file.read_text(errors="replace")
+    text = sized(file, GRASPS).read_text(errors="replace")
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can blow up; no world has any
         raise DexgraspError(f"a world without a document type in {file}", "one with it", "take it away")
     try:
@@ -95,10 +97,12 @@ def _world(file: Path) -> tuple[str, list[float], Array, Array, str]:
 def _transform(element: ElementTree.Element, file: Path) -> Array:
     text = element.findtext("transform/fullTransform") or ""
     found = TRANSFORM.fullmatch(text.strip())
-    if found is None:
+    parts = [re.findall(NUMBER, part) for part in found.groups()] if found else []
+    whole = found and ["".join(part) for part in parts] == ["".join(part.split()) for part in found.groups()]
+    if not whole or [len(part) for part in parts] != [4, 3]:
         remedy = "save the world anew"
-        raise DexgraspError(f"fullTransform (w x y z)[x y z] of each body in {file}", repr(text), remedy)
-    turn, place = (np.array([part.split()], dtype=np.float64) for part in found.groups())
+        raise DexgraspError(f"fullTransform (w x y z)[x y z] of each body in {file}", repr(text[:200]), remedy)
+    turn, place = (np.array([part], dtype=np.float64) for part in parts)
     return posed(MILLIMETRE * place, quaternions(turn, str(file)))
 
 

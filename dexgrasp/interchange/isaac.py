@@ -1,6 +1,5 @@
 """NVIDIA's isaac_grasp YAML, version 1.0: one gripper, one object; metres, radians, quaternions {w, xyz}."""
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -10,20 +9,11 @@ import yaml
 from dexgrasp.errors import DexgraspError
 from dexgrasp.interchange.format import Format, Told
 from dexgrasp.interchange.grasp_set import GraspSet, Posture, posed, quaternions, wxyz
+from dexgrasp.sensing.limits import GRASPS, head, sized
+from dexgrasp.sensing.plain_yaml import read_yaml
 
 VERSION = 1.0
 PREGRASP = "pregrasp_cspace_position"
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML's safe loader, which also reads 1e-05 as a number, as YAML 1.2 does."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?(?:\d+\.\d*|\.\d+|\d+)(?:[eE][-+]?\d+)?$|[-+]?\.(?:inf|Inf)$|\.(?:nan|NaN)$"),
-    list("-+0123456789."),
-)
 
 
 class Isaac(Format):
@@ -34,13 +24,13 @@ class Isaac(Format):
 
     def recognises(self, path: Path) -> bool:
         """By its first key."""
-        return path.is_file() and path.suffix in (".yaml", ".yml") and b"isaac_grasp" in path.read_bytes()[:4096]
+        return path.is_file() and path.suffix in (".yaml", ".yml") and b"isaac_grasp" in head(path, 4096)
 
     def read(self, path: Path, told: Told) -> GraspSet:
         """Joints are those of `cspace_position`, the same in every grasp, or those told."""
         try:
-            content = yaml.load(path.read_text(), _Loader)
-        except (OSError, ValueError, yaml.YAMLError) as error:
+            content = read_yaml(sized(path, GRASPS).read_text())
+        except (OSError, ValueError, RecursionError, OverflowError, yaml.YAMLError) as error:
             raise DexgraspError(f"YAML in {path}", " ".join(str(error).split())[:200], "mend it") from error
         version = str(content.get("format_version")) if isinstance(content, dict) else ""
         if (

@@ -14,6 +14,7 @@ import torch
 from dexgrasp.errors import DexgraspError
 from dexgrasp.interchange.format import Format, Told
 from dexgrasp.interchange.grasp_set import Array, GraspSet, Posture, posed
+from dexgrasp.sensing.limits import sized
 
 
 class MultiDex(Format):
@@ -29,9 +30,9 @@ class MultiDex(Format):
     def read(self, path: Path, told: Told) -> GraspSet:
         """Joints and units have to be told; `hand` where the file holds several robots."""
         try:
-            content = torch.load(path, map_location="cpu", weights_only=True)
+            content = torch.load(sized(path), map_location="cpu", weights_only=True)
         except Exception as error:  # whatever is wrong in such a file, it is the file's fault
-            found = f"{type(error).__name__}: {str(error).splitlines()[0]:.200}"
+            found = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
             raise DexgraspError(f"tensors and plain containers in {path}", found, "ask for plain data") from error
         rows = _rows(content, path, told)
         robots = sorted({robot for _, _, robot in rows})

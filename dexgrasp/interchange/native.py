@@ -9,6 +9,7 @@ import numpy as np
 from dexgrasp.errors import DexgraspError
 from dexgrasp.interchange.format import Format, Told
 from dexgrasp.interchange.grasp_set import GraspSet, Posture
+from dexgrasp.sensing.limits import head, sized
 
 SCHEMA = "dexgrasp.grasps/1"
 ARRAYS = ("scale", "score", "world_T_object", "touching")
@@ -23,14 +24,14 @@ class Native(Format):
 
     def recognises(self, path: Path) -> bool:
         """By the header's schema."""
-        return path.is_file() and path.suffix == ".safetensors" and SCHEMA.encode() in path.read_bytes()[:100_000]
+        return path.is_file() and path.suffix == ".safetensors" and SCHEMA.encode() in head(path, 100_000)
 
     def read(self, path: Path, told: Told) -> GraspSet:
         """Nothing has to be told."""
         from safetensors import SafetensorError, safe_open
 
         try:
-            with safe_open(path, "np") as file:
+            with safe_open(sized(path), "np") as file:
                 header = json.loads((file.metadata() or {})["dexgrasp"])
                 arrays = {key: file.get_tensor(key).astype(np.float64) for key in file.keys()}  # noqa: SIM118
             if header["schema"] != SCHEMA or header["units"] != ["m", "rad"]:
@@ -45,7 +46,7 @@ class Native(Format):
                 given["touching"] = given["touching"] > 0
             texts: dict[str, Any] = {key: tuple(header[key]) for key in ("joint_names", "objects", "names")}
             return GraspSet(hand=header["hand"], **texts, **given, **stages)
-        except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        except (OSError, SafetensorError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             raise DexgraspError(
                 f"a grasp file {path}", f"{type(error).__name__}: {error}", "convert it anew"
             ) from error

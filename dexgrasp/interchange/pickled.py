@@ -8,15 +8,21 @@ arguments, and every other name is refused before anything is called.
 import io
 import pickle
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from dexgrasp.errors import DexgraspError
+from dexgrasp.sensing.arrays import load_npy
+from dexgrasp.sensing.limits import GRASPS, sized
 
 KINDS = "biufcSU?"
 """Kinds of numbers and texts of which arrays may be."""
 DEEPEST = 50
+MOST = 1_000_000
+"""Values of one pickle, each counted as often as it stands in another: a small one can stand for endlessly many."""
+WIDEST = 4096
+"""Bytes, or letters, of one value of an array."""
 
 
 class _Refused(Exception):
@@ -27,7 +33,9 @@ class _Dtype:
     """Notes what a dtype is made of; only its byte order is taken from its state."""
 
     def __init__(self, text: Any) -> None:
-        self.text, self.order = str(text), ""
+        if not isinstance(text, str) or len(text) > 20:
+            raise _Refused("an array of structures")
+        self.text, self.order = text, ""
 
     def __setstate__(self, state: Any) -> None:
         order = state[1] if isinstance(state, tuple) and len(state) > 1 else None
@@ -36,7 +44,7 @@ class _Dtype:
         self.order = "" if order in "|=" else order
 
     def made(self) -> np.dtype[Any]:
-        if not (self.text[:1] in KINDS and self.text[1:].isdigit()):
+        if not (self.text[:1] in KINDS and self.text[1:].isdigit() and 0 < int(self.text[1:]) <= WIDEST):
             raise _Refused(f"an array of dtype {self.text[:20]!r}")
         return np.dtype(self.order + self.text)
 
@@ -91,12 +99,22 @@ def _from_buffer(buffer: Any, dtype: Any, shape: Any, order: Any, *rest: Any) ->
     return made
 
 
+def _pairs(items: Any = ()) -> dict[Any, Any]:
+    """What an ordered dictionary is made of."""
+    if not isinstance(items, list | tuple) or any(
+        not isinstance(each, list | tuple) or len(each) != 2 for each in items
+    ):
+        raise _Refused("a dictionary of no pairs")
+    _hashed([key for key, _ in items])
+    return dict(items)
+
+
 def _permitted() -> dict[tuple[str, str], _Call]:
     names: dict[tuple[str, str], _Call] = {
         ("numpy", "dtype"): _Call(lambda text, *rest: _Dtype(text)),
         ("numpy", "ndarray"): _Call(None),
         ("_codecs", "encode"): _Call(_text_bytes),
-        ("collections", "OrderedDict"): _Call(lambda *items: dict(*items)),
+        ("collections", "OrderedDict"): _Call(_pairs),
     }
     for package in ("numpy.core.multiarray", "numpy._core.multiarray"):
         names[package, "_reconstruct"] = _Call(lambda *arguments: _Array())
@@ -105,10 +123,43 @@ def _permitted() -> dict[tuple[str, str], _Call]:
     return names
 
 
-class _Reader(pickle.Unpickler):
+_PYTHONS: Any = vars(pickle)["_Unpickler"]
+
+
+class _Reader(_PYTHONS):  # type: ignore[misc]
+    """Python's own reader in Python: that in C takes memory as a pickle tells it to, before anything is checked."""
+
+    dispatch: ClassVar[dict[int, Any]] = dict(_PYTHONS.dispatch)
+
     def __init__(self, file: io.BufferedIOBase) -> None:
         super().__init__(file)
         self.names = _permitted()
+
+    def load_setitem(self) -> None:
+        _hashed(self.stack[-2:-1])
+        super().load_setitem()
+
+    def load_setitems(self) -> None:
+        _hashed(self.stack[::2])
+        super().load_setitems()
+
+    def load_dict(self) -> None:
+        _hashed(self.stack[::2])
+        super().load_dict()
+
+    def load_additems(self) -> None:
+        _hashed(self.stack)
+        super().load_additems()
+
+    def load_frozenset(self) -> None:
+        _hashed(self.stack)
+        super().load_frozenset()
+
+    dispatch[pickle.SETITEM[0]] = load_setitem
+    dispatch[pickle.SETITEMS[0]] = load_setitems
+    dispatch[pickle.DICT[0]] = load_dict
+    dispatch[pickle.ADDITEMS[0]] = load_additems
+    dispatch[pickle.FROZENSET[0]] = load_frozenset
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in self.names:
@@ -119,10 +170,17 @@ class _Reader(pickle.Unpickler):
         raise _Refused("a persistent object")
 
 
+def _hashed(keys: list[Any]) -> None:
+    """Keys are texts and numbers: to hash tuples of tuples can take for ever."""
+    for key in keys:
+        if not isinstance(key, str | bytes | int | float | _Scalar | None):
+            raise _Refused(f"a {type(key).__name__.lstrip('_').lower()} as a key")
+
+
 def load(file: io.BufferedIOBase, where: str) -> Any:
     """Return the data of a pickle; raises DexgraspError where it holds anything but data, or is no pickle."""
     try:
-        return _plain(_Reader(file).load(), DEEPEST)
+        return _plain(_Reader(file).load(), DEEPEST, [MOST])
     except _Refused as refused:
         remedy = "do not open it with anything that trusts it; ask its author for plain data"
         raise DexgraspError(f"nothing but data in {where}", f"a pickle that asks for {refused}", remedy) from None
@@ -133,28 +191,30 @@ def load(file: io.BufferedIOBase, where: str) -> Any:
 def read_npy(path: Path) -> Any:
     """Return what a .npy file holds: an array, or for arrays of objects the plain object (one) or list (several)."""
     try:
-        with open(path, "rb") as file:
+        with io.BytesIO(sized(path, GRASPS).read_bytes()) as file:
             version = np.lib.format.read_magic(file)
             header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
             _, _, dtype = header(file)
             if dtype.hasobject:
                 return load(file, str(path))
-            file.seek(0)
-            return np.lib.format.read_array(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+            return load_npy(file.getvalue())
+    except DexgraspError:
+        raise
+    except Exception as error:  # whatever is wrong in such a file
         raise DexgraspError(f"a NumPy file {path}", f"{type(error).__name__}: {error}", "check the path") from error
 
 
-def _plain(value: Any, depth: int) -> Any:
+def _plain(value: Any, depth: int, left: list[int]) -> Any:
     """Return data in which arrays stand for their stand-ins."""
-    if depth == 0:
+    left[0] -= 1
+    if depth == 0 or left[0] < 0:
         raise _Refused("containers within containers without end")
     if isinstance(value, dict):
-        return {_plain(key, depth - 1): _plain(each, depth - 1) for key, each in value.items()}
+        return {_plain(key, depth - 1, left): _plain(each, depth - 1, left) for key, each in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
-        return type(value)(_plain(each, depth - 1) for each in value)
+        return type(value)(_plain(each, depth - 1, left) for each in value)
     if isinstance(value, _Array):
-        return _array(value, depth)
+        return _array(value, depth, left)
     if isinstance(value, _Scalar):
         if not isinstance(value.dtype, _Dtype) or not isinstance(value.raw, bytes):
             raise _Refused("a number that is none")
@@ -164,7 +224,7 @@ def _plain(value: Any, depth: int) -> Any:
     raise _Refused(f"a {type(value).__name__.lstrip('_').lower()}")
 
 
-def _array(value: _Array, depth: int) -> Any:
+def _array(value: _Array, depth: int, left: list[int]) -> Any:
     state = value.state
     if not isinstance(state, tuple) or len(state) != 5 or not isinstance(state[2], _Dtype):
         raise _Refused("an array without its state")
@@ -175,7 +235,7 @@ def _array(value: _Array, depth: int) -> Any:
     if dtype.text.startswith("O"):
         if not isinstance(raw, list):
             raise _Refused("an array of objects that is no list")
-        values = [_plain(each, depth - 1) for each in raw]
+        values = [_plain(each, depth - 1, left) for each in raw]
         return values[0] if shape == () and len(values) == 1 else values
     if not isinstance(raw, bytes):
         raise _Refused("an array without its bytes")

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from dexgrasp.errors import DexgraspError
+from dexgrasp.sensing.arrays import load_npy
 from dexgrasp.sensing.limits import TEXT, sized
 from dexgrasp.sensing.plain_yaml import read_yaml
 
@@ -102,10 +102,10 @@ def _file(path: Path) -> Any:
     sized(path, TEXT)
     try:
         if path.suffix == ".npy":
-            return np.load(path, allow_pickle=False)
+            return load_npy(path.read_bytes())
         text = path.read_text()
         return json.loads(text) if path.suffix == ".json" else read_yaml(text)
-    except (ValueError, OSError, EOFError, yaml.YAMLError, RecursionError) as error:
+    except Exception as error:  # whatever is wrong in such a file
         raise _wrong(f"{path}: {type(error).__name__}: {error}") from error
 
 

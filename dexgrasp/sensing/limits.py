@@ -5,7 +5,9 @@ from pathlib import Path
 from dexgrasp.errors import DexgraspError
 
 FILE = 1 << 30
-"""Bytes of a cloud, an image, or a grasp file."""
+"""Bytes of a cloud, an image, a grasp file of tensors."""
+GRASPS = 256 << 20
+"""Bytes of a grasp file that is text or a pickle."""
 TEXT = 16 << 20
 """Bytes of intrinsics, poses, and other small texts."""
 POINTS = 50_000_000
@@ -20,6 +22,12 @@ def sized(path: Path, most: int = FILE) -> Path:
     if size > most:
         raise DexgraspError(f"at most {most / 2**20:.0f} MiB in {path}", f"{size / 2**20:.0f} MiB", "crop or thin it")
     return path
+
+
+def head(path: Path, count: int) -> bytes:
+    """Return the first `count` bytes of a file, however large it is."""
+    with path.open("rb") as file:
+        return file.read(count)
 
 
 def counted(count: int, where: str) -> int:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dexgrasp.cloud_file import load_npy, load_npz
 from dexgrasp.errors import DexgraspError
+from dexgrasp.sensing.arrays import load_npy, load_npz
 from dexgrasp.sensing.limits import counted, sized
 
 KINDS = (".png", ".npy", ".npz")
@@ -23,7 +23,9 @@ def read_mask(path: str | Path, value: int | None = None) -> NDArray[np.bool_]:
     content = sized(path).read_bytes()
     try:
         image = parse_mask(content, kind)
-    except (ValueError, KeyError, IndexError, EOFError, OSError, TypeError, SyntaxError, RuntimeError) as error:
+    except DexgraspError:
+        raise
+    except Exception as error:  # whatever is wrong in such a file
         raise DexgraspError(f"a mask in {path}", f"{type(error).__name__}: {error}", "write it again") from error
     return image != 0 if value is None else image == value
 

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from dexgrasp.errors import DexgraspError
+from dexgrasp.sensing.arrays import load_npy
 from dexgrasp.sensing.limits import TEXT, sized
 from dexgrasp.sensing.plain_yaml import read_yaml
 
@@ -77,7 +77,7 @@ def _file(path: Path, what: str) -> Any:
     sized(path, TEXT)
     try:
         if path.suffix == ".npy":
-            return np.load(path, allow_pickle=False)
+            return load_npy(path.read_bytes())
         text = path.read_text()
         if path.suffix == ".json":
             return _inside(json.loads(text))
@@ -85,7 +85,7 @@ def _file(path: Path, what: str) -> Any:
             return _inside(read_yaml(text))
         rows = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
         return np.array([row for row in rows if row], dtype=np.float64)
-    except (ValueError, OSError, EOFError, yaml.YAMLError, RecursionError) as error:
+    except Exception as error:  # whatever is wrong in such a file
         raise _wrong(what, f"{path}: {type(error).__name__}: {error}") from error
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from dexgrasp.heads import Layers
 from dexgrasp_pointnet2.pooling import ball_max
 
 
@@ -16,7 +17,7 @@ def mlp(widths: Sequence[int]) -> nn.Sequential:
     layers: list[nn.Module] = []
     for before, after in itertools.pairwise(widths):
         layers += [nn.Linear(before, after, bias=False), nn.BatchNorm1d(after), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers)
+    return Layers(*layers)
 
 
 class SetAbstraction(nn.Module):
@@ -78,9 +79,13 @@ class FeaturePropagation(nn.Module):
         nearest: Int[Tensor, "N K"],
     ) -> Float[Tensor, "N E"]:
         squared = (coarse_points[nearest] - points[:, None]).square().sum(-1)
-        weights = 1 / (squared + 1e-8)
+        weights = 1 / (1e8 * squared + 1)  # 1 / (squared + 1e-8): as a term of its own, ONNX drops 1e-8
         weights = weights / weights.sum(1, keepdim=True)
-        rows = F.embedding_bag(nearest, self.coarse(coarse).float(), mode="sum", per_sample_weights=weights)
+        below = self.coarse(coarse).float()
+        if torch.compiler.is_compiling():  # other runtimes have no embedding_bag
+            rows = (below[nearest] * weights.unsqueeze(-1)).sum(dim=1)
+        else:
+            rows = F.embedding_bag(nearest, below, mode="sum", per_sample_weights=weights)
         if self.skip is not None:
             rows = rows + self.skip(skip)
         return self.rest(F.relu(self.norm(rows)))

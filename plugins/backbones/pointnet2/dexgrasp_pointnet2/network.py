@@ -100,7 +100,7 @@ class PointNet2(Backbone):
         own = torch.cat([cloud[..., 3:], HEIGHT * cloud[..., 2:3]], dim=-1) if self.height else cloud[..., 3:]
         features = [self.stem(own.flatten(0, 1))]
         for i, layer in enumerate(self.encoder):
-            size = len(levels[i]) // batch
+            size = levels[i].shape[0] // batch  # not len: an exported network takes clouds of any size
             centres = levels[i][_flat(plan[f"sample_{i}"], size)]
             features.append(layer(levels[i], features[i], centres, _flat(plan[f"group_{i}"], size)))
             levels.append(centres)

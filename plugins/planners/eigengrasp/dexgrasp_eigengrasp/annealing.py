@@ -12,7 +12,7 @@ from dexgrasp.distance import Field
 from dexgrasp.hand_body import HandBody, carry, place_links
 from dexgrasp_eigengrasp.energy import Wanted, state_energy
 
-TRIES = 10
+TRIES = 11
 """Neighbours that are drawn before a step is given up, all of them in collision."""
 APART, TURN = 0.01, 0.3
 """Of states nearer to each other than these, m and rad, the best is kept."""

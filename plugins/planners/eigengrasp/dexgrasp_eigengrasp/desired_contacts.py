@@ -4,7 +4,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from dexgrasp.hand import tip_frame
 from dexgrasp.hand_body import HandBody, hand_body
 from dexgrasp.urdf import UrdfHand
 
@@ -30,7 +29,7 @@ def desired_contacts(
     for number, finger in enumerate(hand.fingers):
         tip = int(body.tip_links[number])
         if TIPS in where:
-            inward = -tip_frame(finger)[:3, 1].numpy()
+            inward = -finger.tip_frame[:3, 1].numpy()
             found.append((tip, finger.tip_center.numpy() + finger.tip_radius * inward, inward))
         if LINKS not in where:
             continue

@@ -43,6 +43,10 @@ ROOM = 0.25
 """The palm stays so near to the object's surrounding ball, m."""
 OVERLAP = 1e-3
 """Deepest overlap with the object that is no collision, m."""
+LIE = 0.004
+"""Objects that lie alike to this (m of height, and part of a unit normal) have the same plan."""
+PLANS = 512
+"""Plans that are kept."""
 FIELDS = 64
 """Objects whose distance fields are kept."""
 
@@ -62,6 +66,7 @@ class EigenGrasp(Planner):
         epsilon: grasps of more are offered.
         penetration: deepest overlap of the closed hand and the object, m.
         obstacles: whether table, neighbours, fixtures and the way there are in the way.
+        seed: of annealing.
         approach: how that way is checked, fields of `dexgrasp.dataset.clutter.Approach`.
     """
 
@@ -74,7 +79,7 @@ class EigenGrasp(Planner):
         steps: int = 4000,
         best: int = 20,
         energy: str = "guided",
-        contacts: Sequence[str] = (PALM, LINKS, TIPS),
+        contacts: Sequence[str] = (TIPS,),
         synergy: str | None = None,
         friction: float = 0.5,
         edges: int = 8,
@@ -82,6 +87,7 @@ class EigenGrasp(Planner):
         epsilon: float = 0.0,
         penetration: float = 1e-3,
         obstacles: bool = True,
+        seed: int = 0,
         approach: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(hand)
@@ -89,7 +95,7 @@ class EigenGrasp(Planner):
             raise DexgraspError("a UrdfHand", type(hand).__name__, "describe the hand by a URDF")
         _sound(chains, steps, best, energy, contacts, penetration)
         self.chains, self.steps, self.best = chains, steps, best
-        self.told = friction, edges, torsion
+        self.told, self.seed = (friction, edges, torsion), seed
         self.epsilon, self.penetration, self.obstacles = epsilon, penetration, obstacles
         self.approach = read(Approach, dict(approach or {}), "planner.approach")
         self.body, self.shape, self.closing = hand_body(hand), HandShape(hand), Centring(hand)
@@ -98,25 +104,38 @@ class EigenGrasp(Planner):
         links, points = desired_contacts(hand, tuple(contacts))
         least, directions = min(3, fewest_fingers(hand)), golden_spiral(DIRECTIONS, -1.0).numpy()
         self.wanted = Wanted(links, points, directions, float(friction), least, energy == "guided")
+        self._plans: dict[tuple[int, tuple[float, ...]], tuple[Object, Grasps]] = {}
         self._fields: dict[int, tuple[Object, DistanceField]] = {}
 
     def plan(self, situation: Situation, top_k: int) -> Grasps:
-        """Return grasps of all objects, greatest epsilon first, camera frame; the same for the same seed."""
+        """Return grasps of all objects, greatest epsilon first, camera frame.
+
+        `situation.seed` is not used: an object that lies as it lay at another look has the same grasps again.
+        """
         poses = situation.poses.double()
         fields = [self.field(item) for item in situation.objects]
         found = []
         for number, item in enumerate(situation.objects):
-            table = poses[number, 2] if self.obstacles else None
-            grasps = self.grasp(item, table, situation.seed + number)
+            grasps = self.planned(item, poses[number, 2])
             found.append(grasps.moved(poses[number]).replace(object=torch.full((len(grasps),), number)))
         if not found:
-            return _none(self.hand)
+            return Grasps.none(len(self.hand.joint_names), len(self.hand.fingers))
         grasps = Grasps.cat(found)
         if self.obstacles and len(grasps):
             boxes = situation.fixtures
             grasps = grasps[clear(self.shape, self.hand, grasps, poses, fields, self.approach, boxes)]
         order = torch.argsort(grasps.quality, descending=True, stable=True)[:top_k]
         return grasps[order].moved(inverse(situation.view.world_T_camera.double()))
+
+    def planned(self, item: Object, table: Float[Tensor, "4"]) -> Grasps:
+        """Return grasps of an object that lies so (third row of world_T_object), own frame; kept for another look."""
+        near = torch.round(table / LIE) * LIE
+        key = id(item), tuple(near.tolist()) if self.obstacles else ()
+        if key not in self._plans:
+            if len(self._plans) == PLANS:
+                del self._plans[next(iter(self._plans))]
+            self._plans[key] = item, self.grasp(item, near if self.obstacles else None, self.seed)
+        return self._plans[key][1]
 
     def grasp(self, item: Object, table: Float[Tensor, "4"] | None, seed: int) -> Grasps:
         """Return grasps of one object alone in its own frame, greatest epsilon first.
@@ -126,7 +145,7 @@ class EigenGrasp(Planner):
         field, model = self.field(item), WrenchModel.about(item, self.hand, *self.told)
         bases, joints = self.states(item, table, seed)
         if not len(bases):
-            return _none(self.hand)
+            return Grasps.none(len(self.hand.joint_names), len(self.hand.fingers))
         closed, touches, depth = self._close(field, bases, joints)
         touched = torch.from_numpy(np.isfinite(touches[..., 0]))
         whole = (touched[:, None] == self.sets).all(dim=2).any(dim=1).numpy() & (depth <= self.penetration)
@@ -185,17 +204,11 @@ class EigenGrasp(Planner):
     def _close(
         self, field: DistanceField, bases: np.ndarray, joints: np.ndarray
     ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
-        """Auto-grasp; return bases and joints, contacts (N, F, 6) and depth (N,). Fingers that miss stay as they were."""
+        """Auto-grasp; return bases and joints, contacts (N, F, 6), depth (N,). Fingers that miss stay."""
         everything = self.closing.close(field.field, bases, joints)
         touching = np.isfinite(everything[3][..., 0])
-        again = self.closing.close(field.field, bases, joints, touching=touching)
-        placed, _, full, touches, _, depth = again
+        placed, _, full, touches, _, depth = self.closing.close(field.field, bases, joints, touching=touching)
         return (placed, np.ascontiguousarray(full[:, self.body.leaders])), touches, depth
-
-
-def _none(hand: Hand) -> Grasps:
-    empty = torch.zeros(0, 4, 4, dtype=torch.float64)
-    return Grasps.build(empty, torch.zeros(0, len(hand.joint_names), dtype=torch.float64), len(hand.fingers))
 
 
 def _sound(chains: int, steps: int, best: int, energy: str, contacts: Sequence[str], penetration: float) -> None:

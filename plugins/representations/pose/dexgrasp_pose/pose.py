@@ -15,6 +15,7 @@ from dexgrasp.heads import (
     CERTAIN,
     Heads,
     JointBins,
+    any_finger,
     contact_points,
     every_finger,
     finger_loss,
@@ -131,6 +132,10 @@ class Pose(Representation):
         told = self.stage_2(features)
         shaped = {name: told[name].unflatten(-1, (self.versions, *shape)) for name, shape in self.shapes.items()}
         return self.stage_1(features) | shaped
+
+    def graspable(self, features: Float[Tensor, "N C"]) -> Float[Tensor, "N"]:
+        """Return the logit of the score, from the first head alone."""
+        return any_finger(self.stage_1(features)["finger"])
 
     def loss(self, prediction: Prediction, targets: Targets) -> dict[str, Tensor]:
         """Return the terms finger, offset, rotation, joints and, where told, touching.
