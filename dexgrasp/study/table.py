@@ -81,7 +81,7 @@ def line(study: Study, folder: Path, judgement: str, method: str) -> Line | None
         tuple(run["summary"]["success_rate"]["value"] for run in runs),
         float(np.median([each["seconds"]["predict"] for run in runs for each in run["attempts"]])),
         float(np.mean([_making(fact) for fact in facts])) if facts else None,
-        next((fact["model"]["parameters"] for fact in facts if "model" in fact), None),
+        next((_parameters(fact) for fact in facts), None),
         nothing / max(sum(tries), 1),
     )
 
@@ -116,6 +116,12 @@ def write_tables(study: Study, folder: Path, failed: Mapping[str, str]) -> Path:
         json.dumps({"title": study.title, "tables": kept, "failed": dict(failed)}, indent=1)
     )
     return path
+
+
+def _parameters(facts: Mapping[str, Any]) -> int | None:
+    """Return the number of weights of what was made."""
+    told = (facts.get("model") or facts.get("facts") or {}).get("parameters")
+    return None if told is None else int(told)
 
 
 def _making(facts: Mapping[str, Any]) -> float:
