@@ -1,10 +1,10 @@
 """Grasps of what was seen: object by object, clear of everything that was seen, fingers closed on the surface."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -46,6 +46,15 @@ class Predicted:
     pregrasp_pose: Float[Tensor, "N 4 4"]
     pregrasp_joints: Float[Tensor, "N J"]
     sight: Sight
+
+    def ranked(self, order: Int[Tensor, "N"]) -> "Predicted":
+        """Return the same grasps in another order."""
+        return replace(
+            self,
+            grasps=self.grasps[order],
+            pregrasp_pose=self.pregrasp_pose[order],
+            pregrasp_joints=self.pregrasp_joints[order],
+        )
 
 
 def predict_sight(

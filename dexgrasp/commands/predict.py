@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 
 from dexgrasp import offer
+from dexgrasp.arm import Arm, build_arm
 from dexgrasp.checkpoint import WEIGHTS
 from dexgrasp.cloud_file import Capture, read_cloud
 from dexgrasp.errors import DexgraspError
+from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
 from dexgrasp.model import GraspNet, load_model
-from dexgrasp.prediction import predict_sight
+from dexgrasp.prediction import Predicted, predict_sight
+from dexgrasp.reachability import Reach, reachable
 from dexgrasp.report import write_results
 from dexgrasp.segmentation import load_segmenter
 from dexgrasp.selection import Selection
@@ -41,10 +44,14 @@ def main(config: DictConfig) -> None:
     model = _model(given)
     to_base = _motion(given, "camera_to_base")
     flange = _motion(given, "flange")
+    arm = build_arm(config.arm) if given.get("arm") else None
     captures = _captures(given)
     began = time.perf_counter()
     sight, frame, motion = _see(given, captures, to_base, segmenter)
     predicted = predict_sight(model, sight, given["top_k"], selection, _target(given), given["seed"])
+    reach = None if arm is None else _reach(arm, model, predicted, motion, frame, given["seed"])
+    if reach is not None:
+        predicted = predicted.ranked(reach.order)
     seconds = time.perf_counter() - began
     out_T_camera = torch.from_numpy(motion)
     moved = predicted.grasps.moved(out_T_camera)
@@ -55,6 +62,7 @@ def main(config: DictConfig) -> None:
     flange_T_base = None if flange is None else torch.from_numpy(flange)
     table = None if sight.table_T_camera is None else (motion @ np.linalg.inv(sight.table_T_camera)).tolist()
     results = {
+        "arm": None if arm is None else arm.name,
         "title": f"{len(moved)} grasps for {', '.join(Path(str(each)).name for each in _listed(given['input']))}",
         "model": str(given["model"]),
         "hand": model.hand.name,
@@ -68,6 +76,9 @@ def main(config: DictConfig) -> None:
         "seed": given["seed"],
         "grasps": offer.told(predicted, model.hand, out_T_camera, flange_T_base),
     }
+    if reach is not None:
+        for row, place in zip(results["grasps"], reach.order.tolist(), strict=True):
+            row["reach"] = reach.as_dict(place)
     write_results(folder, "prediction", results, version=2)
     if len(moved):
         offer.write_isaac(folder / "grasps.yaml", predicted, model.hand, out_T_camera, frame)
@@ -79,6 +90,22 @@ def main(config: DictConfig) -> None:
         from dexgrasp.viewer import show
 
         show(folder)
+
+
+def _reach(
+    arm: Arm, model: GraspNet, predicted: Predicted, out_T_camera: NDArray[np.float64], frame: str, seed: int
+) -> Reach:
+    """Return which grasps the arm can carry out; its base is the frame in which grasps are told."""
+    if frame != "base":
+        raise DexgraspError(
+            "where the camera stands to the arm's base", "no camera_to_base=", "add it, or leave arm= out"
+        )
+    sight, base_T_camera = predicted.sight, torch.from_numpy(out_T_camera)
+    table = None if sight.table_T_camera is None else torch.from_numpy(sight.table_T_camera)
+    cloud, foot = torch.from_numpy(sight.points), inverse(base_T_camera)
+    reach = reachable(arm, model.hand, predicted.grasps, cloud, foot, table_T_camera=table, seed=seed)
+    print(f"{arm.name} can carry out {int(reach.reachable.sum())} of {len(reach.order)} grasps")
+    return reach
 
 
 def _model(given: dict[str, Any]) -> GraspNet:

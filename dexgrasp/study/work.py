@@ -1,5 +1,6 @@
 """Runs the jobs of a study one after another, each in a process and a folder of its own; what is done is kept."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -47,10 +48,17 @@ def _run(job: Job) -> int:
     again = job.words[0] == "train" and (job.folder / "config.yaml").is_file()
     words = ["train", f"resume={job.folder}"] if again else [*job.words, f"hydra.run.dir={job.folder}"]
     command = [sys.executable, "-m", "dexgrasp", *words]
+    # Set by this very command, for wording of its own; a job would show tracebacks.
+    own_environment = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
     with (job.folder / LOG).open("a") as log:
         # A session of its own: Ctrl-C reaches it once, from here.
         child = subprocess.Popen(
-            command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=end_with_parent
+            command,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env=own_environment,
+            start_new_session=True,
+            preexec_fn=end_with_parent,
         )
         try:
             return child.wait()
