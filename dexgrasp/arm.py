@@ -13,7 +13,7 @@ from torch import Tensor
 from dexgrasp.config import conf_folder
 from dexgrasp.errors import DexgraspError
 from dexgrasp.kinematics import KinematicTree
-from dexgrasp.plugins import _construct, _resolved, read
+from dexgrasp.plugins import construct, read, resolved
 from dexgrasp.urdf_file import UrdfFile
 from dexgrasp.urdf_geometry import link_meshes
 
@@ -135,7 +135,7 @@ def load_arm(name: str, **overrides: Any) -> Arm:
 
 def build_arm(config: Mapping[str, Any]) -> Arm:
     """Return the arm of a composed config: the arguments of `Arm`."""
-    arm = _construct(Arm, _resolved("arm", config))
+    arm = construct(Arm, resolved("arm", config))
     assert isinstance(arm, Arm)
     return arm
 

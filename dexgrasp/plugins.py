@@ -27,6 +27,7 @@ __all__ = [
     "build_planner",
     "build_representation",
     "conf_folders",
+    "construct",
     "hand_options",
     "installed",
     "load_backbone",
@@ -36,6 +37,7 @@ __all__ = [
     "load_representation",
     "names",
     "read",
+    "resolved",
 ]
 
 
@@ -49,7 +51,7 @@ def load_hand(name: str, **overrides: Any) -> "Hand":
 
 def hand_options(name: str) -> dict[str, Any]:
     """Return what the YAML of a hand says, by name or path, every `${...}` replaced; nothing is loaded."""
-    return _resolved("hand", _options("hand", name, {}))
+    return resolved("hand", _options("hand", name, {}))
 
 
 def load_representation(name: str, hand: "Hand", channels: int = 128, **options: Any) -> "Representation":
@@ -75,30 +77,30 @@ def build_hand(config: Mapping[str, Any]) -> "Hand":
     from dexgrasp.hand import Hand
     from dexgrasp.urdf import UrdfHand
 
-    options = _resolved("hand", config)
+    options = resolved("hand", config)
     plain = {"urdf", "fingers"} <= options.keys() and not named("hand", options["name"])
     hand_class = UrdfHand if plain or not find("hand", options["name"]).attr else load_class("hand", options["name"])
-    hand = _construct(hand_class, options)
+    hand = construct(hand_class, options)
     assert isinstance(hand, Hand)
     return hand
 
 
 def build_representation(config: Mapping[str, Any], hand: "Hand", channels: int) -> "Representation":
     """Return the representation of a composed config, as `build_hand`."""
-    options = _resolved("repr", config)
-    return _construct(load_class("repr", options["name"]), options, hand, channels)
+    options = resolved("repr", config)
+    return construct(load_class("repr", options["name"]), options, hand, channels)
 
 
 def build_backbone(config: Mapping[str, Any]) -> "Backbone":
     """Return the backbone of a composed config, as `build_hand`."""
-    options = _resolved("backbone", config)
-    return _construct(load_class("backbone", options["name"]), options)
+    options = resolved("backbone", config)
+    return construct(load_class("backbone", options["name"]), options)
 
 
 def build_planner(config: Mapping[str, Any], hand: "Hand") -> "Planner":
     """Return the planner of a composed config for `hand`, as `build_hand`."""
-    options = _resolved("planner", config)
-    return _construct(load_class("planner", options["name"]), options, hand)
+    options = resolved("planner", config)
+    return construct(load_class("planner", options["name"]), options, hand)
 
 
 def _options(kind: str, name: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -157,7 +159,8 @@ def read(path: Path) -> dict[str, Any]:
     return base | {str(key): value for key, value in config.items()}
 
 
-def _resolved(kind: str, config: Mapping[str, Any]) -> dict[str, Any]:
+def resolved(kind: str, config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a config's keys, every `${...}` replaced; raises DexgraspError where one is open or `name` is missing."""
     from omegaconf import DictConfig, OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
@@ -175,8 +178,8 @@ def _resolved(kind: str, config: Mapping[str, Any]) -> dict[str, Any]:
     return {str(key): value for key, value in options.items()}
 
 
-def _construct(cls: type, options: dict[str, Any], *args: Any) -> Any:
-    """Call the class; keys that its constructor does not have are an error of the config."""
+def construct(cls: type, options: dict[str, Any], *args: Any) -> Any:
+    """Return ``cls(*args, **options)``; raises DexgraspError for keys that it does not have, and for missing ones."""
     parameters = inspect.signature(cls).parameters
     open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
     keywords = {key: value for key, value in options.items() if key != "name" or "name" in parameters}

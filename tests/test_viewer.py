@@ -54,10 +54,12 @@ def exhibit(hand) -> Exhibit:
 def test_a_motion_leads_through_the_grasp_and_lifts_its_object(exhibit):
     motion, grasp = planned(exhibit, 0), exhibit.grasps[0]
     assert list(dict.fromkeys(motion.phases)) == ["approach", "close", "lift"]
-    arrived, closed = motion.phases.index("close"), motion.phases.index("lift")
+    arrived, closed = motion.phases.index("close") - 1, motion.phases.index("lift") - 1
     pose, joints = grasp.pose[0].numpy(), grasp.joints[0].numpy()
     assert np.allclose(motion.base[arrived], pose) and np.allclose(motion.joints[closed], joints)
-    assert (motion.joints[arrived, 1:] < joints[1:]).all() and np.allclose(motion.joints[:arrived], motion.joints[0])
+    assert (motion.joints[arrived, 1:] < joints[1:]).all() and np.allclose(
+        motion.joints[: arrived + 1], motion.joints[0]
+    )
     assert np.isclose(np.linalg.norm(motion.base[0, :3, 3] - pose[:3, 3]), 0.10)
     assert np.allclose(motion.base[-1, :3, 3] - pose[:3, 3], [0, 0, LIFT])
     assert np.allclose(motion.bodies[-1, 0, :3, 3] - motion.bodies[0, 0, :3, 3], [0, 0, LIFT])

@@ -4,21 +4,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 import trimesh
 from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 
-from dexgrasp.execution import pregrasp
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
+from dexgrasp.motion import TrajectorySettings, trajectory
 from dexgrasp.scene import Boxes
 
 Array = NDArray[np.float64]
 LIFT = 0.12
 """m"""
-FRAMES = {"approach": 25, "close": 20, "lift": 25}
-"""Pictures of each part of a motion."""
+RATE = 25.0
+"""Pictures of a planned motion in a second."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,32 +76,20 @@ class Exhibit:
 
 
 def planned(exhibit: Exhibit, number: int) -> Motion:
-    """Return approach, close and lift of one grasp as it is planned: no physics, the object follows the hand.
+    """Return approach, close and lift of one grasp as `trajectory` plans them: no physics, the object follows the hand.
 
-    The base comes straight along the palm's approach with open fingers, as the protocols do it.
+    The fingers stop at the grasp's joints: a squeeze would show them inside the object.
     """
-    hand, grasp = exhibit.hand, exhibit.grasps[number].to("cpu", torch.float64)
-    before, start = pregrasp(hand, grasp)
-    near, far, closed, open_ = grasp.pose[0].numpy(), before[0].numpy(), grasp.joints[0].numpy(), start[0].numpy()
-    shares = {phase: np.linspace(0, 1, count)[:, None] for phase, count in FRAMES.items()}
-    count = len(FRAMES)
-    base, joints = [], []
-    for phase in range(count):
-        share = list(shares.values())[phase]
-        pose = np.repeat(near[None], len(share), axis=0)
-        if phase == 0:
-            pose[:, :3, 3] = far[:3, 3] + share * (near[:3, 3] - far[:3, 3])
-        if phase == count - 1:
-            pose[:, :3, 3] += LIFT * (0.5 - 0.5 * np.cos(np.pi * share)) * np.array(exhibit.up)
-        base.append(pose)
-        joints.append(open_ + (share if phase == 1 else np.full_like(share, phase > 1)) * (closed - open_))
-    poses = np.repeat(resting(exhibit)[None], sum(FRAMES.values()), axis=0)
+    grasp = exhibit.grasps[number]
+    settings = TrajectorySettings(squeeze=0.0, lift=LIFT, rate=RATE)
+    way = trajectory(grasp, exhibit.hand, settings, up=exhibit.up)
+    commanded = [way.joint_names.index(name) for name in way.independent]
+    poses = np.repeat(resting(exhibit)[None], len(way), axis=0)
     held = int(grasp.object[0])
     if 0 <= held < len(exhibit.bodies):
-        rise = base[-1][:, :3, 3] - near[:3, 3]
-        poses[-len(rise) :, held, :3, 3] += rise
-    phases = tuple(phase for phase, frames in FRAMES.items() for _ in range(frames))
-    return Motion(np.concatenate(base), np.concatenate(joints), poses, phases)
+        rise = way.pose[:, :3, 3] - way.pose[way.ends[2], :3, 3]
+        poses[way.ends[2] :, held, :3, 3] += rise[way.ends[2] :]
+    return Motion(way.pose, way.joints[:, commanded], poses, way.phase)
 
 
 def resting(exhibit: Exhibit) -> Float[np.ndarray, "O 4 4"]:

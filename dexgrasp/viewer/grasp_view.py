@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import axis_angle
-from dexgrasp.viewer.exhibit import Exhibit, Motion, planned, resting
+from dexgrasp.viewer.exhibit import RATE, Exhibit, Motion, planned, resting
 from dexgrasp.viewer.hand_figure import HandFigure, as_joints, place
 from dexgrasp.viewer.marks import contacts, friction_cone, shades, skeleton
 
@@ -26,7 +26,7 @@ BESIDE, AWAY = 1.0, 0.5
 """How far to the side of the camera's place a scene is looked at from, rad; and from how far away, m."""
 POINT = 0.0022
 """Size of a point of a cloud, m."""
-PACE = 1 / 25
+PACE = 1 / RATE
 """s from one picture of a motion to the next."""
 
 
