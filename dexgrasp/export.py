@@ -144,6 +144,7 @@ def describe(model: GraspNet, kind: str) -> dict[str, Any]:
         "kind": kind,
         "input": "cloud (N, 6): position (m) and unit normal, level frame: z up, table at z = 0; then indices by name",
         "outputs": outputs,
+        "dtype": str(next(model.parameters()).dtype).removeprefix("torch."),
         "points": model.points,
         "coarse": COARSE if kind == "grasps" and model.scorer is not None else 0,
         "backbone": plain(model.config["backbone"]),

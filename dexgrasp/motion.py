@@ -242,7 +242,8 @@ def lift_direction(up: Sequence[float] | None, hand: Hand, pose: Float[Tensor, "
 
 def _check(grasp: Grasps, hand: Hand) -> None:
     if len(grasp) != 1:
-        raise DexgraspError("one grasp", f"{len(grasp)}", "take a row: grasps[0]")
+        none = "none passed: look at len(grasps) first; a nearer view, or a `Selection` that asks for less, may help"
+        raise DexgraspError("one grasp", f"{len(grasp)}", "take a row: grasps[0]" if len(grasp) else none)
     joints, fingers = grasp.joints.shape[1], grasp.touching.shape[1]
     if joints != len(hand.joint_names) or fingers != len(hand.fingers):
         raise DexgraspError(

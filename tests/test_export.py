@@ -1,5 +1,6 @@
 """Exported graphs say what the network says; shipped weights load by name and carry a card."""
 
+import copy
 import subprocess
 import sys
 from pathlib import Path
@@ -60,6 +61,15 @@ def test_a_graph_says_what_the_network_says(model, tmp_path, kind, suffix):
     assert found.beyond <= (0 if kind == "heads" else 2), found
     worse = compare(model, kind, lambda given: {k: v + np.float32(1e-3) for k, v in run(given).items()}, views, 1e-5)
     assert worse.beyond == worse.rows
+
+
+def test_in_double_precision_no_choice_falls_otherwise(model, tmp_path):
+    double = copy.deepcopy(model).double()
+    views = [view[:900].double() for view in level_views(model, 2)]
+    graph = trace(double, views[0], "grasps")
+    graph.write(tmp_path / "grasps.pt2")
+    found = compare(double, "grasps", runner(tmp_path / "grasps.pt2", graph.inputs), views, 1e-9)
+    assert graph.about["dtype"] == "float64" and found.rows == 400 and found.beyond == 0, found
 
 
 def test_weights_load_by_name_and_carry_a_card(model, tmp_path, monkeypatch):

@@ -49,6 +49,8 @@ def _export(config: DictConfig, folder: Path) -> Any:
             raise DexgraspError(f"{name} out of {', '.join(known)}", str(config[name]), f"set {name}")
     model = load_model(config.model)
     views = list(level_views(model, max(1, config.check), config.seed))
+    if config.double:
+        model, views = model.double(), [view.double() for view in views]
     for kind in config.kinds:
         began = time.perf_counter()
         graph = trace(model, views[0], kind)

@@ -102,7 +102,7 @@ def main():
     normals = estimate_normals(points)
     level_T_camera = level_frame(*find_table(points, generator))
     rotation = level_T_camera[:3, :3].T
-    cloud = np.hstack([points @ rotation + level_T_camera[:3, 3], normals @ rotation]).astype(np.float32)
+    cloud = np.hstack([points @ rotation + level_T_camera[:3, 3], normals @ rotation]).astype(about["dtype"])
 
     plan = indices(cloud[:, :3], about)
     given = {each.name: cloud if each.name == "cloud" else plan[each.name] for each in session.get_inputs()}

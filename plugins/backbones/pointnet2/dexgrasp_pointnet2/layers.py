@@ -47,7 +47,7 @@ class SetAbstraction(nn.Module):
     ) -> Float[Tensor, "M D"]:
         # Positions of a scene differ by millimetres around a metre: half precision would lose them.
         with torch.autocast(points.device.type, enabled=False):
-            rows = self.feature(features.float()) + self.position(points)
+            rows = self.feature(features.to(points)) + self.position(points)
             origin = self.position(centres)
             rows = ball_max(rows, group) if self.factorised else F.embedding(group, rows)
             rows = (rows - origin.reshape(len(group), *[1] * (rows.dim() - 2), -1)).flatten(0, -2)
@@ -81,7 +81,7 @@ class FeaturePropagation(nn.Module):
         squared = (coarse_points[nearest] - points[:, None]).square().sum(-1)
         weights = 1 / (1e8 * squared + 1)  # 1 / (squared + 1e-8): as a term of its own, ONNX drops 1e-8
         weights = weights / weights.sum(1, keepdim=True)
-        below = self.coarse(coarse).float()
+        below = self.coarse(coarse).to(weights)
         if torch.compiler.is_compiling():  # other runtimes have no embedding_bag
             rows = (below[nearest] * weights.unsqueeze(-1)).sum(dim=1)
         else:
