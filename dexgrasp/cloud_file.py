@@ -52,9 +52,9 @@ def read_cloud(path: str | Path, scale: float | None = None, intrinsics: Intrins
 
     Args:
         path: ``.ply``; ``.pcd`` (ascii, binary, compressed); ``.xyz`` or ``.txt`` (x y z, perhaps normals, a line);
-            ``.npy`` (P, 3), (P, 6) or (H, W, 3), or a depth image (H, W); ``.npz`` with `points` and maybe `normals`,
-            or with `depth` (or depth_mm, depth_0p1mm, ...) and maybe `K`; ``.png`` with 16-bit depth. Depth is along
-            the optical axis.
+            ``.npy`` (P, 3), (P, 6) or (H, W, 3), or a depth image (H, W); ``.npz`` with `points` (or `xyz`) and maybe
+            `normals`, or with `depth` (or depth_mm, depth_0p1mm, ...) and maybe `K`; ``.png`` with 16-bit depth. Depth
+            is along the optical axis.
         scale: metres per unit of the file; None: clouds are in metres, depth of whole numbers in millimetres, unless
             the array's name tells the unit.
         intrinsics: of a depth image; None: the file must hold them.
@@ -140,8 +140,9 @@ def _arrays(
             raise ValueError(f"an array of shape {image.shape}, not (P, 3), (P, 6), (H, W, 3), or (H, W) of depth")
         return (*_depth(image, scale, intrinsics, where), 1.0)
     arrays = load_npz(content)
-    if "points" in arrays:
-        points = arrays["points"]
+    cloud = next((name for name in ("points", "xyz") if name in arrays), None)
+    if cloud is not None:
+        points = arrays[cloud]
         shape = points.shape[:2] if points.ndim == 3 else None
         rows = points.reshape(-1, 3).astype(np.float64)
         if "normals" in arrays:

@@ -18,8 +18,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from dexgrasp import launcher, registry
+from dexgrasp import kernel_cache, launcher, registry, usage
 from dexgrasp.errors import DexgraspError, room
+
+log = logging.getLogger(__name__)
 
 
 def package(name: str) -> str:
@@ -41,6 +43,7 @@ def data(name: str, path: str) -> str:
 # At import, so that it is there in every worker process that unpickles a task or a config.
 OmegaConf.register_new_resolver("package", package, replace=True)
 OmegaConf.register_new_resolver("data", data, replace=True)
+OmegaConf.register_new_resolver("usage", usage.text, replace=True)
 OmegaConf.register_new_resolver("first", lambda *values: next((v for v in values if v is not None), None), replace=True)
 
 
@@ -79,6 +82,8 @@ class Task:
         self.__module__ = f"dexgrasp.commands.{command}"  # from which Hydra takes the job's name
 
     def __call__(self, config: DictConfig) -> None:
+        if kernel_cache.cold():
+            log.info("first use: kernels are compiled as they are needed, about a minute of processor time, once")
         main: Callable[[DictConfig], None] = import_module(f"dexgrasp.commands.{self.command}").main
         try:
             with room("what a run writes", Path.cwd()):

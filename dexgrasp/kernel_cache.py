@@ -15,6 +15,12 @@ KEPT = 12
 """States of the sources whose code is kept, the latest ones."""
 
 
+def cold() -> bool:
+    """Tell whether nothing is compiled yet: the first command of a new installation, or after an update."""
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR", ""))
+    return folder.is_dir() and next(folder.rglob("*.nbi"), None) is None
+
+
 def separate(package: Path) -> None:
     """Give compiled code of `package` a folder of its own in the user's cache, unless NUMBA_CACHE_DIR says where.
 

@@ -27,6 +27,8 @@ TOGETHER = 0.12
 """Objects nearer than this (m, horizontally) to the middle of a window are grasped from it."""
 NEAR = 0.05
 """Farthest that the middle of the fingertips may be from what was seen of their object, m."""
+FEWEST = 40
+"""Grasps that are closed on what was seen, at least: fewer wanted are the best of the same."""
 CLOSER, OPENER, STEPS = 0.25, 0.5, 26
 """Fingers are closed on what was seen: so far beyond and before the predicted joints (rad or m), in so many steps."""
 TOUCH = 0.001
@@ -96,7 +98,7 @@ def predict_sight(
     grasps = Grasps.cat(parts)
     # Only what a hand can reach from an object matters; the rest of a room costs time.
     near = _beside(level, sight.labels)
-    clear = select(model.hand, grasps, cloud[near], 2 * top_k, chosen, table)
+    clear = select(model.hand, grasps, cloud[near], max(2 * top_k, FEWEST), chosen, table)
     closed = close_on(model.hand, clear, sight)
     shape = HandShape(model.hand)
     depth = shape.cloud_depth(cloud[near, :3], closed.pose.double(), closed.joints.double())

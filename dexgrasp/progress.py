@@ -46,10 +46,11 @@ def _lines(iterable: Iterable[T], label: str, total: int | None) -> Iterator[T]:
         yield item
         done += 1
         now = time.monotonic()
-        if now - last >= PAUSE:
+        if now - last >= PAUSE and done != total:
             last = now
             print(_line(label, done, total, now - start), file=sys.stderr, flush=True)
-    print(_line(label, done, done, time.monotonic() - start), file=sys.stderr, flush=True)
+    if done or total != 0:
+        print(_line(label, done, done, time.monotonic() - start), file=sys.stderr, flush=True)
 
 
 def _line(label: str, done: int, total: int | None, elapsed: float) -> str:

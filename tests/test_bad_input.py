@@ -254,3 +254,11 @@ def test_settings_say_what_is_wrong():
             read(Policy, wrong, "policy")
     with pytest.raises(DexgraspError, match="no steps"):
         read(TrainerSettings, {"batch": 4, "shards": 2}, "trainer")
+
+
+@pytest.mark.parametrize(
+    ("word", "part"),
+    [("top_k=none", "from 1"), ("top_k=0", "from 1"), ("target=cup", "from 0"), ("scale=mm", "metres per unit")],
+)
+def test_settings_of_predict_that_are_no_numbers(command, word, part):
+    refused(command("predict", "input=x.npy", "model=run", word), word.partition("=")[0], part)

@@ -13,7 +13,7 @@ def main(argv: list[str]) -> int:
     from dexgrasp.interchange.formats import formats, read_grasps, write_grasps
 
     parser = argparse.ArgumentParser(
-        prog="dexgrasp convert",
+        prog="python -m dexgrasp convert",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="formats:\n" + "\n".join(f"  {each.name:14}{each.summary}" for each in formats().values()),

@@ -13,7 +13,7 @@ ACTIONS = {
 
 def main(argv: list[str]) -> int:
     """Run ``hand <action> ...``; return the exit status."""
-    parser = argparse.ArgumentParser(prog="dexgrasp hand", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m dexgrasp hand", description=__doc__)
     parsers = parser.add_subparsers(dest="action", required=True)
     for action, text in ACTIONS.items():
         module = import_module(f"dexgrasp.commands.hand_{action}")

@@ -10,7 +10,7 @@ from dexgrasp import registry
 
 def main(argv: list[str]) -> int:
     """Print kind, name, distribution and one line for every installed plugin."""
-    parser = argparse.ArgumentParser(prog="dexgrasp plugins", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m dexgrasp plugins", description=__doc__)
     parser.add_argument("kind", nargs="?", choices=list(registry.GROUPS), help="only this kind")
     kind = parser.parse_args(argv).kind
     table = Table("kind", "name", "distribution", "what it is", box=None, header_style="bold", pad_edge=False)

@@ -33,12 +33,15 @@ from dexgrasp.sight import Sight, see
 log = logging.getLogger(__name__)
 FRAMES = ("camera", "base")
 REALSENSE = "realsense"
+NONE = """no grasp is clear of what was seen and of the table, and touches its object where it was seen:
+look at grasps.png (are table and objects right?), take a view from nearer by, or try selection.depth=0.006"""
 
 
 def main(config: DictConfig) -> None:
     """Write grasps.yaml, grasps.npz, cloud.npz, grasps.png and results.json; print the best grasps and the folder."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     given: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    _check(given)
     selection = read(Selection, config.selection, "selection")
     segmenter = load_segmenter(given["segmenter"])
     model = _model(given)
@@ -49,7 +52,7 @@ def main(config: DictConfig) -> None:
     began = time.perf_counter()
     sight, frame, motion = _see(given, captures, to_base, segmenter)
     predicted = predict_sight(model, sight, given["top_k"], selection, _target(given), given["seed"])
-    reach = None if arm is None else _reach(arm, model, predicted, motion, frame, given["seed"])
+    reach = None if arm is None else _reach(arm, model, predicted, motion, given["seed"])
     if reach is not None:
         predicted = predicted.ranked(reach.order)
     seconds = time.perf_counter() - began
@@ -83,7 +86,7 @@ def main(config: DictConfig) -> None:
     if len(moved):
         offer.write_isaac(folder / "grasps.yaml", predicted, model.hand, out_T_camera, frame)
     offer.draw(folder / "grasps.png", predicted, model.hand)
-    print(table_of(moved, model.hand.joint_names))
+    print(table_of(moved, model.hand.joint_names) if len(moved) else NONE)
     where = "no table found" if sight.table_T_camera is None else "table found"
     print(f"{where}, {sight.objects} objects, {len(moved)} grasps in {seconds:.2f} s, in the frame {frame!r}\n{folder}")
     if given["view"]:
@@ -92,14 +95,8 @@ def main(config: DictConfig) -> None:
         show(folder)
 
 
-def _reach(
-    arm: Arm, model: GraspNet, predicted: Predicted, out_T_camera: NDArray[np.float64], frame: str, seed: int
-) -> Reach:
+def _reach(arm: Arm, model: GraspNet, predicted: Predicted, out_T_camera: NDArray[np.float64], seed: int) -> Reach:
     """Return which grasps the arm can carry out; its base is the frame in which grasps are told."""
-    if frame != "base":
-        raise DexgraspError(
-            "where the camera stands to the arm's base", "no camera_to_base=", "add it, or leave arm= out"
-        )
     sight, base_T_camera = predicted.sight, torch.from_numpy(out_T_camera)
     table = None if sight.table_T_camera is None else torch.from_numpy(sight.table_T_camera)
     cloud, foot = torch.from_numpy(sight.points), inverse(base_T_camera)
@@ -182,6 +179,25 @@ def _see(
         return sight, "base", to_base @ sight.told_T_camera
     own = np.array_equal(sight.told_T_camera, np.eye(4))
     return sight, "camera" if own else "cloud", sight.told_T_camera
+
+
+def _check(given: dict[str, Any]) -> None:
+    """Raise DexgraspError for settings that are not the numbers that they should be, or lack one another."""
+    if given.get("arm") and given["camera_to_base"] is None and given["frame"] != "base":
+        raise DexgraspError(
+            "where the camera stands to the arm's base", "no camera_to_base=", "add it, or leave arm= out"
+        )
+    for key, least in (("top_k", 1), ("seed", 0), ("target", 0), ("mask_value", None)):
+        value = given[key]
+        if value is None and key in ("target", "mask_value"):
+            continue
+        if type(value) is not int or (least is not None and value < least):
+            raise DexgraspError(
+                f"{key}: a whole number{'' if least is None else f' from {least}'}", repr(value), "mend"
+            )
+    scale = given["scale"]
+    if scale is not None and (type(scale) not in (int, float) or not 0 < scale < float("inf")):
+        raise DexgraspError("scale: metres per unit of the input, above 0", repr(scale), "e.g. 0.001 for millimetres")
 
 
 def _target(given: dict[str, Any]) -> int | None:

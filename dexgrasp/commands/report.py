@@ -10,7 +10,7 @@ from dexgrasp.errors import DexgraspError
 
 def main(argv: list[str]) -> int:
     """Write the leaderboard of the runs that are named, and print where it lies."""
-    parser = argparse.ArgumentParser(prog="dexgrasp report", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m dexgrasp report", description=__doc__)
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="a run, a multirun, or a folder of runs")
     parser.add_argument("--to", type=Path, metavar="DIR", help="default: runs/report/<time>")
     options = parser.parse_args(argv)

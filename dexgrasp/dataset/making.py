@@ -87,7 +87,8 @@ def make_store(folder: Path, stage: Stage, seed: int, start: Callable[[], joblib
         per_shard = stage.per_shard(len(work))
         count = math.ceil(len(work) / per_shard)
         store = Store.create(folder, stage.name, stage.content, seed, count, alone)
-        log.info("making %s in %s: %d of %d shards are missing", stage.name, folder, len(store.missing), count)
+        if count:
+            log.info("making %s in %s: %d of %d shards are missing", stage.name, folder, len(store.missing), count)
         began = time.perf_counter()
         pieces = {i: work[i * per_shard : (i + 1) * per_shard] for i in store.missing}
         shards = _shards(store, stage, pieces, start, share)

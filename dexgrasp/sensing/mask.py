@@ -27,6 +27,9 @@ def read_mask(path: str | Path, value: int | None = None) -> NDArray[np.bool_]:
         raise
     except Exception as error:  # whatever is wrong in such a file
         raise DexgraspError(f"a mask in {path}", f"{type(error).__name__}: {error}", "write it again") from error
+    if value is not None and not (image == value).any():
+        values = ", ".join(f"{each:g}" for each in np.unique(image)[:20].tolist())
+        raise DexgraspError(f"mask_value={value} somewhere in {path}", f"values {values}", "give one of these")
     return image != 0 if value is None else image == value
 
 
@@ -42,7 +45,7 @@ def parse_mask(content: bytes, kind: str) -> NDArray[Any]:
     if kind == ".npy":
         return load_npy(content)
     arrays = load_npz(content)
-    name = next((name for name in ("mask", "label", "labels") if name in arrays), None)
+    name = next((name for name in ("mask", "label", "labels", "segmap") if name in arrays), None)
     if name is None and len(arrays) != 1:
         raise ValueError(f"arrays {sorted(arrays)}, none of them mask or label")
     return arrays[name] if name is not None else next(iter(arrays.values()))
