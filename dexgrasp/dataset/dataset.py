@@ -154,7 +154,7 @@ class Dataset:
         from dexgrasp.dataset.truth import Body
 
         item = self.objects[index]
-        return Body(self.field(index), item.com, item.radius)
+        return Body(self.field(index), item.com, item.radius, item.volume)
 
     def _grasps(self, index: int) -> Grasps:
         """Return all grasps of object `index`, in its frame."""
