@@ -32,8 +32,10 @@ if TYPE_CHECKING:
     from dexgrasp.distance import DistanceField
     from dexgrasp.hand import Hand
 
-KEPT_FIELDS, KEPT_GRASPS = 600_000_000, 400_000_000
-"""Bytes of distance fields and of grasps that each process keeps in memory."""
+MEMORY = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+KEPT_FIELDS, KEPT_GRASPS = max(600_000_000, MEMORY // 12), 400_000_000
+"""Bytes of distance fields and of grasps that each process keeps in memory: making a field anew takes a tenth of a second,
+and where not all fit, a scene needs five."""
 SCHEMA = 1
 """Of a description: {schema, config, hand, representation, stages: {stage: folder, relative to the file's}}."""
 
