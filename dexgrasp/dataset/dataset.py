@@ -34,8 +34,7 @@ if TYPE_CHECKING:
 
 MEMORY = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 KEPT_FIELDS, KEPT_GRASPS = max(600_000_000, MEMORY // 12), 400_000_000
-"""Bytes of distance fields and of grasps that each process keeps in memory: making a field anew takes a tenth of a second,
-and where not all fit, a scene needs five."""
+"""Bytes of distance fields and of grasps that each process keeps; to make a field takes a tenth of a second."""
 SCHEMA = 1
 """Of a description: {schema, config, hand, representation, stages: {stage: folder, relative to the file's}}."""
 
