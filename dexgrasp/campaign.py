@@ -168,8 +168,8 @@ def _work(
         if campaign.reliability and campaign.model is not None:
             seed = int(stream(campaign.seed, "reliability", index).integers(2**31))
             network = _network(campaign.model, campaign.model.stat().st_mtime_ns)
-            view, rules = campaign.look(index, objects, poses, seed), (simulator, campaign.protocol, seed, fixtures)
-            told = trials(network, view, campaign.selection, campaign.reliability, objects, poses, *rules)
+            what = network, campaign.look(index, objects, poses, seed), campaign.selection, campaign.reliability
+            told = trials(*what, objects, poses, simulator, campaign.protocol, seed, fixtures)
         episode = clear(
             index,
             objects,

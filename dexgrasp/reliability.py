@@ -1,4 +1,4 @@
-"""Whether a network's score is the probability that it claims to be: grasps drawn from all that it proposes, executed."""
+"""Whether a network's score is the probability that it claims to be: some of its proposals, executed."""
 
 from collections.abc import Sequence
 from dataclasses import replace
