@@ -61,7 +61,7 @@ def rows(results: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     told = results.get("reliability", {"trials": 0})
     for name in ("calibration_error", "brier_skill", "roc_area") if told["trials"] else ():
         value = "-" if told[name] is None else f"{told[name]:.3f}"
-        table.append((f"score of proposals: {name.replace('_', ' ')}", value, f"{told['trials']} grasps"))
+        table.append((f"score told: {name.replace('_', ' ')}", value, f"{told['trials']} grasps"))
     for stage, seconds in summary["seconds"].items():
         table.append((f"{stage}, median s", "-" if seconds is None else f"{seconds:.3f}", ""))
     return table
