@@ -193,7 +193,7 @@ def _check(given: dict[str, Any]) -> None:
             continue
         if type(value) is not int or (least is not None and value < least):
             raise DexgraspError(
-                f"{key}: a whole number{'' if least is None else f' from {least}'}", repr(value), "mend"
+                f"{key}: a whole number{'' if least is None else f' from {least}'}", repr(value), "correct it"
             )
     scale = given["scale"]
     if scale is not None and (type(scale) not in (int, float) or not 0 < scale < float("inf")):

@@ -1,5 +1,6 @@
 """The fingertip of a finger as the contact representation wants it: circle, closing axis, mid-plane."""
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -183,6 +184,8 @@ def _judge(
     pad = -np.cross(axis, u)
     lines = trimesh.intersections.mesh_plane(mesh, axis, plane + 1e-7 * axis)
     points = lines.reshape(-1, 3) - center if len(lines) else np.asarray(mesh.vertices) - center
+    with contextlib.suppress(QhullError):  # a link of several solids has edges within that touch nothing
+        points = points[ConvexHull(np.stack([points @ pad, points @ u], axis=1)).vertices]
     toward = np.degrees(np.arctan2(points @ pad, -(points @ u)))
     touching = points[(toward > -30) & (toward < 90)]
     size = np.linalg.norm(touching - np.outer(touching @ axis, axis), axis=1) if len(touching) else np.array([radius])
