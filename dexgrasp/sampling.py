@@ -1,6 +1,7 @@
-"""Farthest point sampling and neighbours of a cloud, on the CPU, independent of the order of its points.
+"""Farthest point sampling and neighbours of a cloud, independent of the order of its points.
 
-Each function has a pure-torch reference of the same result, for tests and for other devices.
+The points' device decides how: compiled on the CPU, by `dexgrasp.kernels` on CUDA where Triton is. Each function has a
+pure-torch reference of the same result, for tests. Indices lie where the points lie.
 """
 
 import numpy as np
@@ -9,6 +10,8 @@ from jaxtyping import Float, Int
 from numba import njit
 from scipy.spatial import cKDTree
 from torch import Tensor
+
+from dexgrasp import kernels
 
 _BUCKET = 64
 """Points per bucket: below it the tests of the boxes dominate, above it the distances."""
@@ -20,9 +23,11 @@ def farthest_points(points: Float[Tensor, "N 3"], count: int) -> Int[Tensor, "co
     The first is the point farthest from the middle of the bounding box; equal distances are decided by x, then y,
     then z. More points than there are repeat the first in that order.
     """
+    if kernels.usable(points):
+        return kernels.arrange(points[None]).farthest(count)[0]
     xyz = np.ascontiguousarray(points.detach().cpu().numpy(), dtype=np.float32)
     order = np.argsort(morton(xyz), kind="stable")
-    return torch.from_numpy(order[_farthest(xyz[order], count)])
+    return torch.from_numpy(order[_farthest(xyz[order], count)]).to(points.device)
 
 
 def farthest_points_reference(points: Float[Tensor, "N 3"], count: int) -> Int[Tensor, "count"]:
@@ -43,15 +48,18 @@ def neighbours(
 ) -> Int[Tensor, "M count"]:
     """Return the nearest `count` points within `radius` (m) of each centre, nearest first.
 
-    Where there are fewer, the nearest is repeated (also when it lies outside).
+    Where there are fewer, the nearest is repeated (also when it lies outside). Which of equal distances comes first is
+    left open on the CPU; on CUDA, x decides, then y, then z.
     """
+    if kernels.usable(points):
+        return kernels.arrange(points[None]).nearest(centres[None], count, radius)[0]
     tree = cKDTree(points.detach().cpu().numpy(), balanced_tree=False, compact_nodes=False)
     query = centres.detach().cpu().numpy()
     index = tree.query(query, k=range(1, count + 1), distance_upper_bound=radius)[1]
     lonely = index[:, 0] == tree.n
     if lonely.any():
         index[lonely, 0] = tree.query(query[lonely])[1]
-    return torch.from_numpy(np.where(index == tree.n, index[:, :1], index))
+    return torch.from_numpy(np.where(index == tree.n, index[:, :1], index)).to(points.device)
 
 
 def neighbours_reference(

@@ -77,7 +77,7 @@ class Scorer(nn.Module):
 
 def coarse_points(cloud: Float[Tensor, "N 6"], count: int = COARSE) -> Float[Tensor, "Q 6"]:
     """Return `count` points that are spread evenly over a cloud (farthest-point samples); more begin with fewer."""
-    return cloud[farthest_points(cloud[:, :3].cpu(), min(count, len(cloud))).to(cloud.device)]
+    return cloud[farthest_points(cloud[:, :3], min(count, len(cloud)))]
 
 
 def surroundings(hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"]) -> Float[Tensor, "N K 7"]:
