@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from dexgrasp.checkpoint import read_tensors
 from dexgrasp.child import end_with_parent
 from dexgrasp.dataset.samples import Batch, Samples
+from dexgrasp.device import find_device
 from dexgrasp.errors import DexgraspError
 from dexgrasp.model import GraspNet
 from dexgrasp.progress import track
@@ -224,14 +225,7 @@ def _optimizer(model: GraspNet, settings: TrainerSettings) -> torch.optim.Optimi
 
 def device_of(settings: TrainerSettings) -> torch.device:
     """Return the device to train on; raises DexgraspError where there is none of that name."""
-    name, there = settings.device, torch.cuda.is_available()
-    if name == "auto":
-        return torch.device("cuda" if there else "cpu")
-    if name.partition(":")[0] not in ("cpu", "cuda"):
-        raise DexgraspError("trainer.device auto, cpu or cuda", repr(name), "choose one of them")
-    if name.startswith("cuda") and not there:
-        raise DexgraspError("a CUDA device for trainer.device", "torch sees none", "use trainer.device=cpu")
-    return torch.device(name)
+    return find_device(settings.device, "trainer.device")
 
 
 def _processes(settings: TrainerSettings, device: torch.device) -> int:
