@@ -4,6 +4,7 @@ Rows of an arranged cloud are ranks by x, then y, then z, then the given order: 
 the CPU path takes, and a run of rows lies between two planes of x.
 """
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -30,14 +31,16 @@ class Arranged:
 
     def farthest(self, count: int) -> Int[Tensor, "B count"]:
         """Return `count` rows (int64) of each cloud, see `dexgrasp.sampling.farthest_points`."""
-        chosen = farthest(self.axes, count)
+        with _device(self.axes):
+            chosen = farthest(self.axes, count)
         return self.order.gather(1, chosen.long()).long()
 
     def nearest(
         self, centres: Float[Tensor, "B M 3"], count: int, radius: float = float("inf")
     ) -> Int[Tensor, "B M count"]:
         """Return rows (int64) of the nearest `count` points of each centre, see `dexgrasp.sampling.neighbours`."""
-        return nearest(self.axes, self.order, centres, count, radius)
+        with _device(self.axes):
+            return nearest(self.axes, self.order, centres, count, radius)
 
 
 def arrange(points: Float[Tensor, "B N 3"]) -> Arranged:
@@ -46,8 +49,14 @@ def arrange(points: Float[Tensor, "B N 3"]) -> Arranged:
     batch, total, _ = points.shape
     axes = torch.empty(batch, 3, total, device=points.device)
     order = torch.empty(batch, total, dtype=torch.int32, device=points.device)
-    _arrange[(triton.cdiv(total, ROWS), batch)](points, axes, order, total, ROWS=ROWS, COLUMNS=COLUMNS, num_warps=4)
+    with _device(points):
+        _arrange[(triton.cdiv(total, ROWS), batch)](points, axes, order, total, ROWS=ROWS, COLUMNS=COLUMNS, num_warps=4)
     return Arranged(axes, order)
+
+
+def _device(points: Tensor) -> AbstractContextManager[object]:
+    """Triton launches on the present device, wherever its tensors lie."""
+    return torch.cuda.device(points.device) if points.is_cuda else nullcontext()
 
 
 @triton.jit
