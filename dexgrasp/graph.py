@@ -8,7 +8,7 @@ and taken from the record while the graph is captured.
 
 import logging
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -136,7 +136,8 @@ class Captured:
     def __call__(self, cloud: Float[Tensor, "N 6"]) -> Grasps:
         """Return grasps at the seeds of a cloud (level frame), see `GraspNet.propose`."""
         if self._graph is None and self.eager is None and len(cloud) == self.points:
-            self._capture(cloud)
+            with torch.cuda.device(cloud.device) if cloud.is_cuda else nullcontext():
+                self._capture(cloud)
         if self.eager is None and len(cloud) == self.points:
             self._cloud.copy_(cloud)
             self._graph.replay()
