@@ -11,7 +11,7 @@ from torch.utils._pytree import tree_leaves
 
 from dexgrasp import config
 from dexgrasp.errors import DexgraspError
-from dexgrasp.graph import Captured, Constants, propose
+from dexgrasp.graph import Captured, Constants, joined, propose
 from dexgrasp.model import GraspNet, build_model, load_model, save_model
 from dexgrasp.sampling import farthest_points
 from dexgrasp.scorer import Scorer
@@ -105,6 +105,15 @@ def test_propose_finds_the_indices_itself(model):
     found = propose(model, given)
     for name, value in found.tensors().items():
         torch.testing.assert_close(value, expected.tensors()[name], equal_nan=True)
+
+
+def test_joined_layers_predict_the_same(model):
+    given = cloud()
+    found, expected = propose(joined(model), given), propose(model, given)
+    for name, value in found.tensors().items():
+        torch.testing.assert_close(value, expected.tensors()[name], equal_nan=True, atol=1e-4, rtol=1e-4)
+    norms = [sum(isinstance(m, torch.nn.BatchNorm1d) for m in net.modules()) for net in (joined(model), model)]
+    assert norms[0] < norms[1] and model.scorer is not None
 
 
 def test_without_cuda_it_says_so_and_predicts(model, caplog):

@@ -47,8 +47,8 @@ def arrange(points: Float[Tensor, "B N 3"]) -> Arranged:
     """Return the clouds in order."""
     points = points.detach().float().contiguous()
     batch, total, _ = points.shape
-    axes = torch.empty(batch, 3, total, device=points.device)
-    order = torch.empty(batch, total, dtype=torch.int32, device=points.device)
+    axes = torch.zeros(batch, 3, total, device=points.device)
+    order = torch.zeros(batch, total, dtype=torch.int32, device=points.device)  # NaN has no rank
     with _device(points):
         _arrange[(triton.cdiv(total, ROWS), batch)](points, axes, order, total, ROWS=ROWS, COLUMNS=COLUMNS, num_warps=4)
     return Arranged(axes, order)

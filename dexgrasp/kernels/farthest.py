@@ -85,7 +85,7 @@ def _first(axes, chosen, told, share, total, count, BLOCK: tl.constexpr):
         where = tl.where(apart > most, at, where)
         most = tl.maximum(apart, most)
     reach = tl.max(most, axis=0)
-    tl.store(chosen + cloud * count, tl.min(tl.where(most == reach, where, total), axis=0))
+    tl.store(chosen + cloud * count, tl.min(tl.where(most == reach, where, total - 1), axis=0))
     tl.store(told + cloud * 2, 0)
     tl.store(told + cloud * 2 + 1, 1)
     tl.store(share + cloud, 0.9)
@@ -175,7 +175,7 @@ def _round(axes, nearest, chosen, kept, rows, last, part, total, count, BLOCK: t
         where = tl.where(distance > most, at, where)
         most = tl.maximum(distance, most)
     reach = tl.max(most, axis=0)
-    farthest = tl.min(tl.where(most == reach, where, total), axis=0)
+    farthest = tl.min(tl.where(most == reach, where, total - 1), axis=0)
 
     limit = reach  # beyond which lie the candidates
     low = reach * 0.0
