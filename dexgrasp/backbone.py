@@ -15,6 +15,8 @@ class Backbone(nn.Module, ABC):
 
     channels: int
     """Size C of a feature."""
+    farthest_first: bool = False
+    """Whether `seeds` are `farthest_points` of the cloud, in their order: then they serve others who need some, too."""
 
     @abstractmethod
     def plan(self, points: Float[Tensor, "N 3"]) -> Plan:

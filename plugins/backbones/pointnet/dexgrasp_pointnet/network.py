@@ -22,6 +22,8 @@ class PointNet(Backbone):
         head: layer sizes on [own feature, maximum] at the seeds.
     """
 
+    farthest_first = True
+
     def __init__(
         self,
         points: int = 2048,

@@ -34,6 +34,8 @@ class PointNet2(Backbone):
             straight onto the seeds (the paper's ablation).
     """
 
+    farthest_first = True
+
     def __init__(
         self,
         points: Sequence[int] = (2048, 512, 128, 32),
