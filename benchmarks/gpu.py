@@ -28,12 +28,11 @@ from dexgrasp.cloud import prepare
 from dexgrasp.dataset.samples import Batch, Samples, collect
 from dexgrasp.device import find_device
 from dexgrasp.errors import DexgraspError
-from dexgrasp.graph import Captured, propose
+from dexgrasp.graph import Captured
 from dexgrasp.level import carried, level_frame
 from dexgrasp.model import GraspNet
 from dexgrasp.representation import Targets
 from dexgrasp.sampling import farthest_points, neighbours, neighbours_reference
-from dexgrasp.scorer import COARSE
 from dexgrasp.table import find_table
 from dexgrasp.testing.views import seen_scenes
 from dexgrasp.training.feed import Feed
@@ -131,12 +130,11 @@ def prediction(model: GraspNet, clouds: list[Tensor], rounds: int, device: torch
     cloud = clouds[0].to(device)
     model.points = len(cloud)
     plan = {name: rows[0] for name, rows in model.backbone.plans(cloud[None, :, :3]).items()}
-    coarse = plan["seeds"][:COARSE]
     captured, half = Captured(model), Captured(model)
 
     def plain() -> None:
         found = plain_plan(model, cloud[:, :3])
-        model.propose(cloud, found, found["seeds"][:COARSE])
+        model.propose(cloud, found)
 
     def in_half() -> None:
         model.precision = "bfloat16"  # at its capture; then it is the graph's
@@ -145,8 +143,8 @@ def prediction(model: GraspNet, clouds: list[Tensor], rounds: int, device: torch
 
     spent = turns(
         {
-            "eager": lambda: propose(model, cloud),
-            "eager, cached indices": lambda: model.propose(cloud, plan, coarse),
+            "eager": lambda: model.propose(cloud),
+            "eager, cached indices": lambda: model.propose(cloud, plan),
             "captured": lambda: captured(cloud),
             "captured, bfloat16": in_half,
             "indices alone": lambda: model.backbone.plans(cloud[None, :, :3]),
@@ -159,7 +157,7 @@ def prediction(model: GraspNet, clouds: list[Tensor], rounds: int, device: torch
         "ms": {name: statistics.median(values) for name, values in spent.items()},
         "no graph": captured.eager,
         "largest difference of poses, captured and eager": float(
-            (captured(cloud).pose - propose(model, cloud).pose).abs().max()
+            (captured(cloud).pose - model.propose(cloud).pose).abs().max()
         ),
     }
 

@@ -21,8 +21,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from dexgrasp.grasps import Grasps
 from dexgrasp.heads import Layers, _folded
-from dexgrasp.sampling import farthest_points
-from dexgrasp.scorer import COARSE
 
 if TYPE_CHECKING:
     from dexgrasp.model import GraspNet
@@ -108,21 +106,11 @@ class _Copied(TorchDispatchMode):
         return func(*args, **kwargs)
 
 
-def propose(model: "GraspNet", cloud: Float[Tensor, "N 6"]) -> Grasps:
-    """Return `model.propose(cloud)`, its indices found where the cloud lies."""
-    plan = {name: rows[0] for name, rows in model.backbone.plans(cloud[None, :, :3]).items()}
-    coarse = None
-    if model.scorer is not None:
-        count = min(COARSE, len(cloud))
-        spread = model.backbone.farthest_first and len(plan["seeds"]) >= count
-        coarse = plan["seeds"][:count] if spread else farthest_points(cloud[:, :3], count)
-    return model.propose(cloud, plan, coarse)
-
-
 @torch.no_grad()
 def joined(model: "GraspNet") -> "GraspNet":
     """Return a copy for prediction whose linear layers hold the batch norms behind them: fewer launches."""
     model = copy.deepcopy(model).eval()
+    model.captured = None
     for layers in [module for module in model.modules() if isinstance(module, Layers)]:
         for place, (layer, norm) in enumerate(pairwise(layers)):
             if isinstance(layer, nn.Linear) and isinstance(norm, nn.BatchNorm1d):
@@ -134,7 +122,7 @@ def joined(model: "GraspNet") -> "GraspNet":
 
 
 class Captured:
-    """`propose` of a network for clouds of `model.points` points, captured at the first one with its present weights.
+    """`GraspNet.propose` for clouds of `model.points` points, captured at the first one with the weights of then.
 
     Others, and where a graph cannot be captured, are served without, and the log says so once: the same grasps, slower.
     """
@@ -163,7 +151,7 @@ class Captured:
         if not self._said:
             self._said = True
             log.warning("no CUDA graph: %s", self.eager or f"{len(cloud)} points, captured for {self.points}")
-        return propose(self.model, cloud)
+        return self.model.launch(cloud)
 
     def _capture(self, cloud: Float[Tensor, "N 6"]) -> None:
         if not cloud.is_cuda:
@@ -177,11 +165,11 @@ class Captured:
                 network = joined(self.model)
                 for _ in range(WARM):
                     with self._constants.record():
-                        propose(network, self._cloud)
+                        network.propose(self._cloud)
             torch.cuda.current_stream(cloud.device).wait_stream(beside)
             graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(graph), self._constants.replay():
-                self._grasps = propose(network, self._cloud)
+                self._grasps = network.propose(self._cloud)
             self._network, self._graph = network, graph  # whose weights the graph reads
         except RuntimeError as error:
             torch.cuda.synchronize(cloud.device)

@@ -31,7 +31,7 @@ from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.level import carried, level_frame
 from dexgrasp.representation import Prediction, Representation, Targets
-from dexgrasp.scorer import Scorer, coarse_points, surroundings
+from dexgrasp.scorer import COARSE, Scorer, coarse_points, surroundings
 from dexgrasp.selection import Selection, select
 from dexgrasp.table import find_table
 
@@ -101,21 +101,27 @@ class GraspNet(nn.Module):
         One set for each of `choices` answers, at most as many as the representation can give; at the `most` seeds that
         the heads think most graspable, None: all.
         """
+        rows, chosen, grasps = self._told(cloud, plan, choices, most)[:3]
+        return rows, chosen, [grasps[start : start + len(rows)] for start in range(0, len(grasps), len(rows))]
+
+    def _told(
+        self, cloud: Float[Tensor, "N 6"], plan: Plan | None, choices: int, most: int | None
+    ) -> tuple[Float[Tensor, "M C"], Int[Tensor, "M"], Grasps, Int[Tensor, "S"]]:
+        """Return the same, all answers in one, one after the other; and all seeds."""
         training = self.training
-        self.eval()
+        if training:
+            self.eval()
         one = None if plan is None else {key: row[None] for key, row in plan.items()}
         features, seeds = self._features(cloud[None], one)
-        rows, chosen = features[0], seeds[0]
+        rows, chosen, count = features[0], seeds[0], max(1, min(choices, self.representation.choices))
         if most is not None and most < len(rows):
             best = self.representation.graspable(rows).topk(most).indices
             rows, chosen = rows[best], chosen[best]
-        points, normals = cloud[chosen].split(3, dim=1)
-        grasps = [
-            self.representation.decode(points, normals, self.representation(rows, choice=choice))
-            for choice in range(max(1, min(choices, self.representation.choices)))
-        ]
-        self.train(training)
-        return rows, chosen, grasps
+        points, normals = cloud[chosen].repeat(count, 1).split(3, dim=1)
+        grasps = self.representation.decode(points, normals, self.representation.answers(rows, count))
+        if training:
+            self.train()
+        return rows, chosen, grasps, seeds[0]
 
     @torch.no_grad()
     def propose(
@@ -126,15 +132,24 @@ class GraspNet(nn.Module):
         One per seed, or as many as the scorer is used to choosing from. `plan` and `coarse` (rows of `coarse_points`,
         for a scorer) are found here where None.
         """
-        if plan is None and self.captured is not None:
-            return self.captured(cloud)
+        captured = self.captured if plan is None else None
+        return self.launch(cloud, plan, coarse) if captured is None else captured(cloud)
+
+    @torch.no_grad()
+    def launch(
+        self, cloud: Float[Tensor, "N 6"], plan: Plan | None = None, coarse: Int[Tensor, "Q"] | None = None
+    ) -> Grasps:
+        """Return the same as `propose`, launched step by step."""
         if self.scorer is None:
             return self.told(cloud, plan)[2][0]
-        scorer = self.scorer.eval()
-        features, seeds, grasps = self.told(cloud, plan, scorer.choices, scorer.most)
-        at, spread = cloud[seeds], coarse_points(cloud) if coarse is None else cloud[coarse]
-        logits = [scorer(features, at, told, surroundings(self.hand, told, spread)) for told in grasps]
-        return Grasps.cat([told.replace(quality=logit.sigmoid()) for told, logit in zip(grasps, logits, strict=True)])
+        scorer = self.scorer.eval() if self.scorer.training else self.scorer
+        features, seeds, grasps, every = self._told(cloud, plan, scorer.choices, scorer.most)
+        answers = len(grasps) // len(seeds)
+        if coarse is None and self.backbone.farthest_first and len(every) >= min(COARSE, len(cloud)):
+            coarse = every[:COARSE]
+        spread = coarse_points(cloud) if coarse is None else cloud[coarse]
+        features, at = features.repeat(answers, 1), cloud[seeds].repeat(answers, 1)
+        return grasps.replace(quality=scorer(features, at, grasps, surroundings(self.hand, grasps, spread)).sigmoid())
 
     def predict(
         self,

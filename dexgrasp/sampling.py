@@ -12,6 +12,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dexgrasp import kernels
+from dexgrasp.borrow import borrowed
+from dexgrasp.cells import BITS, Cells, find_cell, make_cells
 
 _BUCKET = 64
 """Points per bucket: below it the tests of the boxes dominate, above it the distances."""
@@ -53,13 +55,15 @@ def neighbours(
     """
     if kernels.usable(points):
         return kernels.arrange(points[None]).nearest(centres[None], count, radius)[0]
-    tree = cKDTree(points.detach().cpu().numpy(), balanced_tree=False, compact_nodes=False)
-    query = centres.detach().cpu().numpy()
-    index = tree.query(query, k=range(1, count + 1), distance_upper_bound=radius)[1]
-    lonely = index[:, 0] == tree.n
+    cloud, query = (part.detach().cpu().double().numpy() for part in (points, centres))
+    if radius == float("inf"):
+        index = cKDTree(cloud, balanced_tree=False, compact_nodes=False).query(query, k=range(1, count + 1))[1]
+        return torch.from_numpy(np.where(index == len(cloud), index[:, :1], index)).to(points.device)
+    index = _in_ball(make_cells(cloud, radius), query, count, radius)
+    lonely = index[:, 0] < 0
     if lonely.any():
-        index[lonely, 0] = tree.query(query[lonely])[1]
-    return torch.from_numpy(np.where(index == tree.n, index[:, :1], index)).to(points.device)
+        index[lonely] = cKDTree(cloud).query(query[lonely])[1][:, None]
+    return torch.from_numpy(index).to(points.device)
 
 
 def neighbours_reference(
@@ -70,6 +74,48 @@ def neighbours_reference(
     distance, index = table.topk(min(count, len(points)), dim=1, largest=False)
     index = torch.where(distance < radius, index, index[:, :1])
     return torch.cat([index, index[:, :1].expand(-1, count - index.shape[1])], dim=1)
+
+
+@njit(cache=True)
+def _in_ball(cells: Cells, centres: np.ndarray, count: int, radius: float) -> np.ndarray:
+    """Return `neighbours` of centres (M, 3), from the cells about each; -1 where there are none."""
+    cells, centres = borrowed(cells), borrowed(centres)
+    low, side = cells.low, cells.side
+    px, py, pz = cells.points
+    index = np.empty((len(centres), count), np.int64)
+    near, apart = np.empty(len(px), np.int64), np.empty(len(px))
+    best = np.empty(count)
+    for m in range(len(centres)):
+        x, y, z = centres[m]
+        i, j, k = int((x - low[0]) / side) + 1, int((y - low[1]) / side) + 1, int((z - low[2]) / side) + 1
+        total, found = 0, 0
+        for a in range(i - 1, i + 2):
+            for b in range(j - 1, j + 2):
+                for c in range(k - 1, k + 2):
+                    key = (a << 2 * BITS) | (b << BITS) | c
+                    slot = find_cell(cells.keys, key)
+                    if cells.keys[slot] != key:
+                        continue
+                    start = cells.starts[slot]
+                    for n in range(cells.stops[slot] - start):
+                        u, v, w = px[start + n] - x, py[start + n] - y, pz[start + n] - z
+                        near[total + n], apart[total + n] = start + n, u * u + v * v + w * w
+                    total += cells.stops[slot] - start
+        limit = radius * radius
+        for n in range(total):
+            d = apart[n]
+            if d >= limit:
+                continue
+            place = min(found, count - 1)
+            while place > 0 and best[place - 1] > d:
+                best[place], index[m, place] = best[place - 1], index[m, place - 1]
+                place -= 1
+            best[place], index[m, place] = d, cells.order[near[n]]
+            found = min(found + 1, count)
+            if found == count:
+                limit = best[count - 1]
+        index[m, found:] = index[m, 0] if found else -1
+    return index
 
 
 def _squared(vectors: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:

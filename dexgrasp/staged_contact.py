@@ -226,7 +226,7 @@ class StagedContact(Representation):
         """
         outputs = self.stages["finger"](features)
         if truth is None:
-            return outputs | self._tell(features, outputs["finger"], None, choice)
+            return outputs | self._tell(features, outputs["finger"], None, (choice,))
         rows = contact_points(truth)
         if len(rows) < FEWEST:  # too few for batch statistics
             return outputs | self._tell(features, outputs["finger"], truth)
@@ -236,14 +236,24 @@ class StagedContact(Representation):
             for name, value in told.items()
         }
 
+    def answers(self, features: Float[Tensor, "N C"], count: int) -> Prediction:
+        """Return the first `count` choices; what does not depend on the anchor is found once."""
+        outputs = self.stages["finger"](features)
+        told = self._tell(features, outputs["finger"], None, range(count))
+        return {"finger": outputs["finger"].repeat(count, 1)} | told
+
     def graspable(self, features: Float[Tensor, "N C"]) -> Float[Tensor, "N"]:
         """Return the logit of the score, from the first head alone."""
         return any_finger(self.stages["finger"](features)["finger"])
 
     def _tell(
-        self, features: Float[Tensor, "N C"], classes: Float[Tensor, "N K"], truth: Targets | None, choice: int = 0
+        self,
+        features: Float[Tensor, "N C"],
+        classes: Float[Tensor, "N K"],
+        truth: Targets | None,
+        choices: Sequence[int] = (0,),
     ) -> Prediction:
-        """Run stages 2 and 3, head by head, each knowing what was decided before it."""
+        """Run stages 2 and 3, head by head, each knowing what was decided before it; (choices * N, ...)."""
         finger = classes[:, 1:].argmax(-1)
         if truth is not None:
             finger = torch.where(truth.finger > 0, truth.finger - 1, finger)
@@ -258,8 +268,13 @@ class StagedContact(Representation):
             shapes = {"projection": (len(self.anchors), 1 + self.told), "touching": (self.fingers,)}
             shape = shapes[name] if name in shapes else (len(self.slots[name]), 2, self.joints.most)
             shaped[name] = raw[name].unflatten(-1, (self.versions, *shape))
-            if name == "projection" and choice:
-                shaped[name] = _without_likeliest(shaped[name], choice)
+            if name == "projection":
+                every = [_without_likeliest(shaped[name], choice) if choice else shaped[name] for choice in choices]
+                shaped[name] = torch.cat(every)
+                if len(every) > 1:
+                    features, finger = features.repeat(len(every), 1), finger.repeat(len(every))
+                    known = [part.repeat(len(every), 1) for part in known]
+                    raw = {head: value.repeat(len(every), 1) for head, value in raw.items()}
             if self.conditioned and name != "supporting":
                 known.append(self._decided(name, shaped[name], finger, truth))
         position = [(self.first_slots + self.second_slots).index(slot) for slot in self.main_slots]

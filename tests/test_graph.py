@@ -11,9 +11,8 @@ from torch.utils._pytree import tree_leaves
 
 from dexgrasp import config
 from dexgrasp.errors import DexgraspError
-from dexgrasp.graph import Captured, Constants, joined, propose
+from dexgrasp.graph import Captured, Constants, joined
 from dexgrasp.model import GraspNet, build_model, load_model, save_model
-from dexgrasp.sampling import farthest_points
 from dexgrasp.scorer import Scorer
 from dexgrasp.testing.samples import seen
 
@@ -98,18 +97,9 @@ def test_constants_are_what_was_copied():
         torch.zeros(3).to("meta").add_(1)
 
 
-def test_propose_finds_the_indices_itself(model):
-    given = cloud()
-    plan = model.backbone.plan(given[:, :3])
-    expected = model.propose(given, plan, farthest_points(given[:, :3], 512))
-    found = propose(model, given)
-    for name, value in found.tensors().items():
-        torch.testing.assert_close(value, expected.tensors()[name], equal_nan=True)
-
-
 def test_joined_layers_predict_the_same(model):
     given = cloud()
-    found, expected = propose(joined(model), given), propose(model, given)
+    found, expected = joined(model).propose(given), model.propose(given)
     for name, value in found.tensors().items():
         torch.testing.assert_close(value, expected.tensors()[name], equal_nan=True, atol=1e-4, rtol=1e-4)
     norms = [sum(isinstance(m, torch.nn.BatchNorm1d) for m in net.modules()) for net in (joined(model), model)]
@@ -121,7 +111,7 @@ def test_without_cuda_it_says_so_and_predicts(model, caplog):
     with caplog.at_level(logging.WARNING):
         grasps = [captured(given), captured(given)]
     assert [record.message for record in caplog.records] == ["no CUDA graph: the network is not on a CUDA device"]
-    assert torch.equal(grasps[0].pose, propose(model, given).pose)
+    assert torch.equal(grasps[0].pose, model.propose(given).pose)
 
 
 def test_a_checkpoint_is_loaded_as_told(model, tmp_path):
@@ -149,8 +139,8 @@ def test_a_graph_gives_what_eager_gives(representation):
     captured = Captured(model)
     for seed in (0, 1, 0, 2):
         given = cloud(seed).cuda()
-        found, expected = captured(given), propose(model, given)
+        found, expected = captured(given), model.propose(given)
         assert captured.eager is None
         for name, value in found.tensors().items():
             torch.testing.assert_close(value, expected.tensors()[name], equal_nan=True)
-    assert len(captured(cloud(0, 900).cuda())) == len(propose(model, cloud(0, 900).cuda()))  # another size: eager
+    assert len(captured(cloud(0, 900).cuda())) == len(model.propose(cloud(0, 900).cuda()))  # another size: eager
