@@ -17,7 +17,7 @@ def find_device(name: str | torch.device, key: str) -> torch.device:
     if kind not in ("cpu", "cuda") or (number and not number.isdecimal()):
         raise DexgraspError(f"{key} auto, cpu, cuda or cuda:1", repr(name), "choose one of them")
     if kind == "cuda" and not there:
-        raise DexgraspError(f"a CUDA device for {key}", "torch sees none", f"use {key}=cpu")
+        raise DexgraspError(f"a CUDA device for {key}={name}", "torch sees none", f"use {key}=cpu")
     if kind == "cuda" and int(number or 0) >= torch.cuda.device_count():
-        raise DexgraspError(f"a CUDA device for {key}", f"{name} of {torch.cuda.device_count()}", "choose another")
+        raise DexgraspError(f"a CUDA device for {key}={name}", f"{name} of {torch.cuda.device_count()}", "choose another")
     return torch.device(name)
