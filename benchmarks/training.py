@@ -74,7 +74,9 @@ def steps(model: GraspNet, samples: Samples, settings: TrainerSettings, rounds: 
         for views in order(len(samples), settings, 0, step + 2):
             batch = samples.batch(views)
             lap("read")
-            prediction, _ = model(batch.cloud, batch.plan, batch.targets)
+            with torch.autocast("cpu", torch.bfloat16, enabled=settings.precision == "bfloat16"):
+                prediction, _ = model(batch.cloud, batch.plan, batch.targets)
+            prediction = {name: value.float() for name, value in prediction.items()}
             lap("forward")
             loss = torch.stack(list(model.representation.loss(prediction, batch.targets).values())).sum()
             lap("loss")
