@@ -30,6 +30,7 @@ from dexgrasp.planner import Planner, Situation
 from dexgrasp.plugins import build_planner
 from dexgrasp.prediction import predict_sight
 from dexgrasp.progress import track
+from dexgrasp.reliability import reliability, trials
 from dexgrasp.scene import View
 from dexgrasp.seeds import stream
 from dexgrasp.segmentation import clusters
@@ -62,6 +63,8 @@ class Campaign:
     """Whether a network's grasps are those of `predict`: of objects segmented by geometry, closed on what was seen."""
     oracle: int = 0
     """Labels of each object that the oracle may try, see `ceilings`."""
+    reliability: int = 0
+    """A network's proposals that are executed on each untouched scene, see `trials`."""
     drawn: int = 8
     """Scenes whose attempts are kept for pictures."""
 
@@ -74,7 +77,7 @@ class Campaign:
         parallel = joblib.Parallel(n_jobs=workers, return_as="generator", initializer=end_with_parent)
         jobs = (joblib.delayed(_work)(self, index, label_ceilings) for index in range(count))
         done = list(track(parallel(jobs), f"evaluation, {self.protocol.name}", total=count))
-        episodes = [episode for episode, _ in done]
+        episodes = [episode for episode, _, _ in done]
         results: dict[str, Any] = {
             "protocol": str(self.protocol),
             "protocol_values": self.protocol.values(),
@@ -87,7 +90,11 @@ class Campaign:
             "attempts": attempt_rows(episodes),
         }
         if label_ceilings:
-            results["ceilings"] = _ceiling_rates([verdicts for _, verdicts in done], self.seed)
+            results["ceilings"] = _ceiling_rates([verdicts for _, verdicts, _ in done], self.seed)
+        if self.reliability:
+            told = [row for _, _, rows in done for row in rows]
+            scores, success = torch.tensor([score for score, _ in told]), torch.tensor([bool(win) for _, win in told])
+            results["reliability"] = reliability(scores, success)
         return episodes, results
 
     def look(self, scene: int, objects: Sequence[Object], poses: Float[Tensor, "O 4 4"], seed: int) -> View:
@@ -142,7 +149,9 @@ class Campaign:
         return float(model.epsilon(closure.contacts, closure.normals).values[0])
 
 
-def _work(campaign: Campaign, index: int, label_ceilings: bool) -> tuple[Episode, dict[str, list[bool]]]:
+def _work(
+    campaign: Campaign, index: int, label_ceilings: bool
+) -> tuple[Episode, dict[str, list[bool]], list[tuple[float, bool]]]:
     """One scene; the worker's only entry."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -155,6 +164,12 @@ def _work(campaign: Campaign, index: int, label_ceilings: bool) -> tuple[Episode
         if label_ceilings:
             labels, rules = dataset.scene_grasps(index), (dataset.hand, simulator, campaign.protocol, campaign.seed)
             verdicts = ceilings(index, objects, poses, labels, *rules, fixtures, campaign.oracle)
+        told: list[tuple[float, bool]] = []
+        if campaign.reliability and campaign.model is not None:
+            seed = int(stream(campaign.seed, "reliability", index).integers(2**31))
+            network = _network(campaign.model, campaign.model.stat().st_mtime_ns)
+            what = network, campaign.look(index, objects, poses, seed), campaign.selection, campaign.reliability
+            told = trials(*what, objects, poses, simulator, campaign.protocol, seed, fixtures)
         episode = clear(
             index,
             objects,
@@ -170,7 +185,7 @@ def _work(campaign: Campaign, index: int, label_ceilings: bool) -> tuple[Episode
             draw=index < campaign.drawn,
             fixtures=fixtures,
         )
-        return episode, verdicts
+        return episode, verdicts, told
     finally:
         torch.set_num_threads(threads)
 

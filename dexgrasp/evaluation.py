@@ -72,6 +72,10 @@ class Policy:
     """A grasp within this distance (m) and angle of one that failed in this scene is not tried."""
     angle: float = 0.5
     """rad"""
+    doubt: float = 0.6
+    """What a grasp is worth after each failure near it, as a share: what has failed once is likely to fail again."""
+    near: float = 0.06
+    """m between contacts"""
 
 
 def clear(
@@ -151,13 +155,24 @@ def present(poses: Float[Tensor, "O 4 4"]) -> list[int]:
 
 
 def choose(offered: Grasps, failed: Sequence[Grasps], policy: Policy) -> Grasps | None:
-    """Return the best offered grasp (world frame) that does not repeat a failed one, None where there is none."""
-    fresh = torch.ones(len(offered), dtype=torch.bool)
+    """Return the offered grasp (world frame) worth most that does not repeat a failed one, None where there is none."""
+    fresh, worth, places = torch.ones(len(offered), dtype=torch.bool), offered.quality.clone(), _place(offered)
     for grasp in failed:
         near = torch.linalg.vector_norm(offered.pose[:, :3, 3] - grasp.pose[:, :3, 3], dim=1) < policy.distance
         alike = rotation_angle(offered.pose[:, :3, :3], grasp.pose[:, :3, :3]) < policy.angle
         fresh &= ~(near & alike)
-    return offered[int(fresh.nonzero()[0, 0])] if fresh.any() else None
+        doubtful = torch.linalg.vector_norm(places - _place(grasp), dim=1) < policy.near
+        worth[doubtful] *= policy.doubt
+    order = torch.argsort(worth, descending=True, stable=True)
+    order = order[fresh[order]]
+    return offered[int(order[0])] if len(order) else None
+
+
+def _place(grasps: Grasps) -> Float[Tensor, "N 3"]:
+    """Return the mean of the contacts that are known, else where the base is."""
+    known = ~grasps.contacts.isnan().any(dim=2, keepdim=True)
+    mean = torch.where(known, grasps.contacts, 0.0).sum(dim=1) / known.sum(dim=1).clamp(min=1)
+    return torch.where(known.any(dim=1), mean, grasps.pose[:, :3, 3])
 
 
 def summarise(episodes: Sequence[Episode], seed: int) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Rigid objects and sets of them: what is grasped."""
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -124,14 +125,15 @@ def load_objects(config: Mapping[str, Any]) -> ObjectSet:
     """Return the set that a config of the group `objects` describes.
 
     ``kind: procedural`` with ``split`` (train, test, all), ``count`` (null: the whole split), ``seed``;
-    ``kind: folder`` with ``path`` and the options of `dexgrasp.meshes.load_folder`.
+    ``kind: folder`` with ``path`` and the options of `dexgrasp.meshes.load_folder`; ``kind: several`` with ``sets``,
+    such configs by name, whose objects become one set.
     Raises DexgraspError for unknown kinds and keys.
     """
     options = {str(key): value for key, value in config.items() if key not in ("kind", "name")}
-    loaders: dict[str, Callable[..., ObjectSet]] = {"procedural": procedural, "folder": _folder}
+    loaders: dict[str, Callable[..., ObjectSet]] = {"procedural": procedural, "folder": _folder, "several": _several}
     kind = config.get("kind")
     if kind not in loaders:
-        raise DexgraspError("objects.kind to be procedural or folder", repr(kind), "set objects.kind")
+        raise DexgraspError("objects.kind to be procedural, folder or several", repr(kind), "set objects.kind")
     try:
         return loaders[str(kind)](**options)
     except TypeError as error:
@@ -145,6 +147,17 @@ def _folder(**options: Any) -> ObjectSet:
 
     objects, skipped = load_folder(**options)
     return ObjectSet(str(options["path"]), tuple(objects), tuple(skipped))
+
+
+def _several(sets: Mapping[str, Mapping[str, Any]]) -> ObjectSet:
+    found = [load_objects(each) for each in sets.values()]
+    names = Counter(item.name for each in found for item in each)
+    twice = [name for name, times in names.items() if times > 1]
+    if twice:
+        remedy = "leave them out of all sets but one (exclude), or draw shapes with another split"
+        raise DexgraspError(f"objects of different names in {sorted(sets)}", f"several {twice[:5]}", remedy)
+    skipped = tuple(row for each in found for row in each.skipped)
+    return ObjectSet(" + ".join(each.name for each in found), tuple(item for each in found for item in each), skipped)
 
 
 def procedural(

@@ -58,6 +58,10 @@ def rows(results: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     ]
     for kind, entry in results.get("ceilings", {}).items():
         table.append((f"ceiling: {kind.replace('_', ' ')} label, %", _percent(entry), f"{entry['trials']} attempts"))
+    told = results.get("reliability", {"trials": 0})
+    for name in ("calibration_error", "brier_skill", "roc_area") if told["trials"] else ():
+        value = "-" if told[name] is None else f"{told[name]:.3f}"
+        table.append((f"score told: {name.replace('_', ' ')}", value, f"{told['trials']} grasps"))
     for stage, seconds in summary["seconds"].items():
         table.append((f"{stage}, median s", "-" if seconds is None else f"{seconds:.3f}", ""))
     return table

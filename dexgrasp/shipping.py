@@ -144,14 +144,19 @@ def _card(
 
 def _data(config: DictConfig) -> Iterator[str]:
     """Yield from what objects the network learnt."""
-    objects = config.dataset.objects
     yield "Grasps, scenes and views are computed by this program; nothing was recorded."
-    if objects.kind == "procedural":
-        yield f"Objects: shapes that this program makes (`{objects.split}`, seed {objects.seed}), Apache-2.0."
+    objects = config.dataset.objects
+    for each in objects.sets.values() if objects.kind == "several" else [objects]:
+        yield from _set(each)
+
+
+def _set(objects: Mapping[str, Any]) -> Iterator[str]:
+    if objects["kind"] == "procedural":
+        yield f"Objects: shapes that this program makes (`{objects['split']}`, seed {objects['seed']}), Apache-2.0."
         return
-    told = [licence for file, (_, licence) in origins(Path(str(objects.path))).items() if _taken(file.stem, objects)]
+    told = [licence for file, (_, licence) in origins(Path(str(objects["path"]))).items() if _taken(file.stem, objects)]
     counted = Counter(licence or "not stated" for licence in told)
-    yield f"Objects: {len(told) or 'an unknown number of'} meshes of the folder `{Path(str(objects.path)).name}`. "
+    yield f"Objects: {len(told) or 'an unknown number of'} meshes of the folder `{Path(str(objects['path'])).name}`. "
     yield "; ".join(f"{count}: {licence}" for licence, count in counted.most_common()) or "Licences: not stated."
 
 

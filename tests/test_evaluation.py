@@ -136,6 +136,10 @@ def test_choose():
     assert choose(offered, [], policy).pose[0, 0, 3] == 0
     assert choose(offered, [offered[0]], policy).pose[0, 0, 3] == pytest.approx(0.1)
     assert choose(offered, [offered[0], offered[1]], policy) is None
+    near = grasps(torch.tensor([[0.04, 0, 0], [0.2, 0, 0]])).replace(quality=torch.tensor([0.9, 0.6]).double())
+    assert choose(near, [], policy).pose[0, 0, 3] == pytest.approx(0.04)
+    assert choose(near, [offered[0]], policy).pose[0, 0, 3] == pytest.approx(0.2), "what is near a failure is doubted"
+    assert choose(near, [offered[0]], Policy(doubt=1.0)).pose[0, 0, 3] == pytest.approx(0.04)
 
 
 def test_absent_objects_are_not_present():

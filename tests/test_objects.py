@@ -83,3 +83,11 @@ def test_sizes_are_drawn_and_repeat() -> None:
     assert max(ratios) > 1.2 and min(ratios) < 0.8
     with pytest.raises(DexgraspError, match=r"objects\.size"):
         procedural("train", 1, 0, (2.0, 1.0))
+
+
+def test_several_sets_are_one() -> None:
+    one, other = ({"kind": "procedural", "split": split, "count": 2} for split in ("train", "test"))
+    both = load_objects({"kind": "several", "sets": {"a": one, "b": other}})
+    assert both.names == (*load_objects(one).names, *load_objects(other).names)
+    with pytest.raises(DexgraspError, match="different names"):
+        load_objects({"kind": "several", "sets": {"a": one, "b": one}})

@@ -21,7 +21,7 @@ def test_lift_v1_is_method_section_5() -> None:
     physics, motion = protocol.physics, protocol.motion
     assert (physics.friction, physics.torsional_friction, physics.density) == (0.6, 0.02, 500)
     assert (physics.mass_min, physics.mass_max, motion.lift, motion.hold) == (0.05, 1, 0.30, 2)
-    assert str(protocol) == "lift-v1 (version 2)"
+    assert str(protocol) == "lift-v1 (version 3)"
 
 
 def test_cmgnet_code_is_method_section_5() -> None:
@@ -68,7 +68,8 @@ def test_transport_and_shake_are_lift_v1_and_more() -> None:
 
 def test_dexgraspbench_is_method_section_5() -> None:
     assert differences("dexgraspbench") == {
-        "mass_min": 0.1, "mass_max": 0.1, "gravity": 0.0, "timestep": 0.004, "contact_time": 0.008, "intrusion": 0.01
+        "mass_min": 0.1, "mass_max": 0.1, "gravity": 0.0, "timestep": 0.004, "contact_time": 0.008, "intrusion": 0.01,
+        "grip_effort": 0.6,
     }  # fmt: skip
     rule = load_protocol("dexgraspbench").disturbance
     assert (rule.force, rule.distance, rule.angle, rule.apart, rule.closing) == (10, 0.05, 15, True, True)

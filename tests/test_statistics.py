@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
+import torch
 
+from dexgrasp.reliability import reliability
 from dexgrasp.statistics import bootstrap_ratio, wilson
 
 
@@ -30,3 +32,15 @@ def test_bootstrap_resamples_scenes_not_attempts():
     scenes = bootstrap_ratio([10, 0], [10, 10])
     attempts = bootstrap_ratio([1] * 10 + [0] * 10, [1] * 20)
     assert scenes[1] - scenes[0] > attempts[1] - attempts[0]
+
+
+def test_reliability_of_what_one_can_work_out() -> None:
+    told, came = torch.tensor([0.25] * 4 + [0.75] * 4), torch.tensor([1, 0, 0, 0, 1, 1, 1, 0]).bool()
+    good = reliability(told, came)
+    assert good["calibration_error"] == pytest.approx(0) and good["roc_area"] == pytest.approx(0.75)
+    assert good["brier_skill"] == pytest.approx(1 - (6 * 0.0625 + 2 * 0.5625) / 8 / 0.25)
+    proud = reliability(torch.full((8,), 0.95), came)
+    assert proud["calibration_error"] == pytest.approx(0.45) and proud["brier_skill"] < 0
+    assert [b["trials"] for b in good["bins"]] == [4, 4]
+    assert reliability(told[:0], came[:0])["trials"] == 0
+    assert reliability(told, torch.ones(8).bool())["brier_skill"] is None

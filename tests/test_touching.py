@@ -163,12 +163,14 @@ def test_truth_asks_of_the_touching_fingers_only(pinches, pinching, can, field) 
     moved = grasps.replace(
         pose=grasps.pose + 2e-4 * torch.eye(4).double().roll(3, 1) * torch.tensor([1.0, 0, 0, 0])[:, None]
     )
-    truth = Truth(Closer(pinching), [Body(field, can.com, can.radius)], torch.eye(4).double()[None], TruthSettings())
+    truth = Truth(
+        Closer(pinching), [Body(field, can.com, can.radius, can.volume)], torch.eye(4).double()[None], TruthSettings()
+    )
     good, quality = truth.holds(moved, grasps)
     assert good.double().mean() > 0.7
     torch.testing.assert_close(quality[good], grasps.quality[good], atol=0.05, rtol=0)
     every = torch.ones_like(moved.touching)
-    assert truth.outcome(grasps)[1].tolist() == [2] * len(grasps)
+    assert truth.outcome(grasps).touched.tolist() == [2] * len(grasps)
     whole, _ = truth.holds(moved.replace(touching=every), grasps)
     assert whole.sum() < 0.6 * good.sum(), "where all have to touch, few do"
 

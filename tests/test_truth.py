@@ -1,5 +1,6 @@
 """The checks of told grasps, against closing the hand oneself."""
 
+import dataclasses
 import math
 
 import pytest
@@ -26,7 +27,7 @@ def closer():
 @pytest.fixture(scope="module")
 def ball():
     mesh = trimesh.creation.icosphere(3, RADIUS)
-    return Body(DistanceField.build(mesh, 0.004), mesh.center_mass, RADIUS)
+    return Body(DistanceField.build(mesh, 0.004), mesh.center_mass, RADIUS, mesh.volume)
 
 
 @pytest.fixture(scope="module")
@@ -129,12 +130,28 @@ def test_the_scene_has_the_last_word(closer, grasps, ball):
 
 
 def test_outcome_says_what_closing_gives(closer, grasps, ball):
-    free, touched, quality = Truth(closer, [ball], HERE).outcome(grasps)
-    assert free.all() and (touched == 3).all()
-    torch.testing.assert_close(quality, grasps.quality, atol=0.05, rtol=0)
+    found = Truth(closer, [ball], HERE).outcome(grasps)
+    assert found.clear.all() and (found.touched == 3).all()
+    torch.testing.assert_close(found.epsilon, grasps.quality, atol=0.05, rtol=0)
     away = grasps.replace(pose=grasps.pose + torch.tensor([0, 0, 0, 1.0, *[0] * 12]).reshape(4, 4))
-    free, touched, quality = Truth(closer, [ball], HERE, clear=lambda told: told.quality > 0.2).outcome(away)
-    assert torch.equal(free, grasps.quality > 0.2) and (touched == 0).all() and (quality == 0).all()
+    found = Truth(closer, [ball], HERE, clear=lambda told: told.quality > 0.2).outcome(away)
+    assert torch.equal(found.clear, grasps.quality > 0.2) and (found.touched == 0).all() and (found.epsilon == 0).all()
     nowhere = grasps.replace(object=torch.full_like(grasps.object, -1))
-    free, touched, quality = Truth(closer, [ball], HERE).outcome(nowhere)
-    assert not free.any() and (touched == 0).all() and (quality == 0).all()
+    found = Truth(closer, [ball], HERE).outcome(nowhere)
+    assert not found.clear.any() and (found.touched == 0).all() and (found.epsilon == 0).all()
+
+
+def test_what_is_too_heavy_is_no_label(closer, grasps, ball):
+    up = torch.tensor([0.0, 0.0, 1.0])
+    held = Truth(closer, [ball], HERE, up=up).outcome(grasps).capacity
+    assert (held > 0).all() and held.min() < held.max()
+    between = float(held.median())
+    told = jittered(grasps, 0.0, 0.0)
+    for settings in (TruthSettings(capacity=between), TruthSettings(capacity=between, same_distance=0.0)):
+        good, quality = Truth(closer, [ball], HERE, settings, up=up).holds(told, grasps)
+        # Closing again moves contacts by microns.
+        sure = (held - between).abs() > 0.05 * between
+        assert torch.equal(good[sure], (held > between)[sure]) and (quality[~good] == 0).all()
+    heavy = dataclasses.replace(ball, volume=100 * ball.volume)
+    lighter = Truth(closer, [heavy], HERE, up=up).outcome(grasps).capacity
+    torch.testing.assert_close(lighter * 1.0, held * max(0.05, 500 * ball.volume) / 1.0, rtol=1e-3, atol=1e-6)

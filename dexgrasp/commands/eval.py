@@ -41,7 +41,7 @@ class Settings:
         """Return the settings of a composed config; raises DexgraspError for what is wrong in it."""
         options = OmegaConf.to_container(config.evaluation, resolve=True)
         assert isinstance(options, dict)
-        for key in ("top_k", "drawn", "oracle"):
+        for key in ("top_k", "drawn", "oracle", "reliability"):
             if type(options[key]) is not int or options[key] < 0:
                 raise DexgraspError(f"evaluation.{key} to be a whole number", repr(options[key]), "set it so")
         if type(options["segmented"]) is not bool:
@@ -100,6 +100,7 @@ def evaluate(config: DictConfig, hand: Mapping[str, Any], checkpoint: Path | Non
         drawn=options["drawn"],
         segmented=options["segmented"],
         oracle=options["oracle"],
+        reliability=options["reliability"],
     )
     workers = options["workers"] or len(os.sched_getaffinity(0))
     episodes, results = campaign.run(workers, options["ceilings"])

@@ -32,8 +32,9 @@ if TYPE_CHECKING:
     from dexgrasp.distance import DistanceField
     from dexgrasp.hand import Hand
 
-KEPT_FIELDS, KEPT_GRASPS = 600_000_000, 400_000_000
-"""Bytes of distance fields and of grasps that each process keeps in memory."""
+MEMORY = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+KEPT_FIELDS, KEPT_GRASPS = max(600_000_000, MEMORY // 12), 400_000_000
+"""Bytes of distance fields and of grasps that each process keeps; to make a field takes a tenth of a second."""
 SCHEMA = 1
 """Of a description: {schema, config, hand, representation, stages: {stage: folder, relative to the file's}}."""
 
@@ -154,7 +155,7 @@ class Dataset:
         from dexgrasp.dataset.truth import Body
 
         item = self.objects[index]
-        return Body(self.field(index), item.com, item.radius)
+        return Body(self.field(index), item.com, item.radius, item.volume)
 
     def _grasps(self, index: int) -> Grasps:
         """Return all grasps of object `index`, in its frame."""

@@ -185,6 +185,8 @@ def _identity(config: dict[str, Any], hand: Hand) -> dict[str, Any]:
 
 def _listing(objects: dict[str, Any]) -> list[Any]:
     """Names and sizes of the files of an object folder, so that a changed folder is another set."""
+    if "sets" in objects:
+        return [_listing(each) for each in objects["sets"].values()]
     if "path" not in objects:
         return []
     folder = Path(objects["path"]).expanduser()

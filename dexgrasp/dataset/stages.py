@@ -169,7 +169,8 @@ def scene_truth(dataset: Dataset, index: int, world_T_frame: Tensor) -> Truth:
         world = told.to(torch.float64).moved(world_T_frame)
         return clear(dataset.shape, dataset.hand, world, scene.poses, obstacles, settings.approach, scene.fixtures)
 
-    return Truth(dataset.closer, bodies, inverse(world_T_frame) @ scene.poses, settings.truth, is_clear)
+    up = inverse(world_T_frame)[:3, 2]
+    return Truth(dataset.closer, bodies, inverse(world_T_frame) @ scene.poses, settings.truth, is_clear, up)
 
 
 @lru_cache(4)

@@ -10,10 +10,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dexgrasp.batch import Batch
 from dexgrasp.distance import DistanceField
 from dexgrasp.execution import opened
 from dexgrasp.geometry import inverse, rotation_angle
 from dexgrasp.grasps import Grasps
+from dexgrasp.load_capacity import Load
 from dexgrasp.wrench_model import WrenchModel
 
 if TYPE_CHECKING:
@@ -45,6 +47,24 @@ class TruthSettings:
     friction: float = 0.5
     edges: int = 8
     torsion: float | None = None
+    capacity: float = 0.0
+    """So many times its object's weight the closed grasp must hold (`dexgrasp.load_capacity`), where `up` is known.
+
+    In `lift-v1`, of labels on real meshes that hold 2 to 3 times the weight 84 % were lifted, with 1 to 1.5 24 %."""
+
+
+@dataclass(frozen=True)
+class Outcome(Batch):
+    """What became of grasps whose fingers were closed on the true object."""
+
+    clear: Bool[Tensor, "N"]
+    """Of table and neighbours, on the whole way in."""
+    touched: Int[Tensor, "N"]
+    """Number of fingers that touch."""
+    epsilon: Float[Tensor, "N"]
+    """0 where the closed hand penetrates."""
+    capacity: Float[Tensor, "N"]
+    """How many times the object's weight the grasp holds; likewise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +76,8 @@ class Body:
     """Centre of mass in object coordinates, m."""
     radius: float
     """Torque scale: largest distance from it to the surface, m."""
+    volume: float
+    """m3"""
 
 
 def deviation(told: Grasps, original: Grasps) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
@@ -73,6 +95,7 @@ class Truth:
         frame_T_object: where they are in the grasps' frame, m.
         settings: how far a grasp may move, and the thresholds of synthesis.
         clear: the scene's own checks, tried last; none where None.
+        up: unit vector against gravity in the grasps' frame; None: nobody asks what a grasp can hold.
     """
 
     def __init__(
@@ -82,8 +105,9 @@ class Truth:
         frame_T_object: Float[Tensor, "O 4 4"],
         settings: TruthSettings | None = None,
         clear: Clear | None = None,
+        up: Float[Tensor, "3"] | None = None,
     ) -> None:
-        self.closer, self.bodies, self.clear = closer, bodies, clear
+        self.closer, self.bodies, self.clear, self.up = closer, bodies, clear, up
         self.object_T_frame = inverse(frame_T_object.double())
         self.settings = settings or TruthSettings()
 
@@ -104,19 +128,22 @@ class Truth:
             rows = (again & (original.object == body)).nonzero().flatten()
             quality[rows] = self._closed_quality(told[rows], body).to(quality)
             good[rows] = quality[rows] >= limits.epsilon
+        kept = good & same if self.up is not None else torch.zeros_like(good)
+        for body in original.object[kept].unique().tolist():
+            rows = (kept & (original.object == body)).nonzero().flatten()
+            known = original[rows].moved(self.object_T_frame[body])
+            held = self._capacity(known.pose, known.joints, known.contacts, known.normals, body)
+            good[rows] = held >= limits.capacity
         rows = (again & good).nonzero().flatten()
         if self.clear is not None and len(rows):
             good[rows] = self.clear(told[rows].replace(object=original.object[rows]))
         return good, torch.where(good, quality, 0.0)
 
-    def outcome(self, grasps: Grasps) -> tuple[Bool[Tensor, "N"], Int[Tensor, "N"], Float[Tensor, "N"]]:
-        """Close grasps on their own `object`; return which are clear, how many fingers touch, and epsilon.
-
-        Nothing is clear or touches where the object is -1; epsilon is 0 where the closed hand penetrates.
-        """
+    def outcome(self, grasps: Grasps) -> Outcome:
+        """Close grasps on their own `object` and tell what came of it; nothing is clear or touches where that is -1."""
         limits = self.settings
         free, touched = grasps.object >= 0, torch.zeros(len(grasps), dtype=torch.long)
-        quality = torch.zeros_like(grasps.quality)
+        quality, capacity = torch.zeros_like(grasps.quality), torch.zeros_like(grasps.quality)
         rows = free.nonzero().flatten()
         if self.clear is not None and len(rows):
             free[rows] = self.clear(grasps[rows])
@@ -125,8 +152,27 @@ class Truth:
             closure = self._closed(grasps[rows], number)
             touched[rows] = closure.touched.sum(dim=1)
             found = torch.as_tensor(self._model(body).epsilon(closure.contacts, closure.normals).values).to(quality)
-            quality[rows] = torch.where(closure.penetration <= limits.penetration, found, 0.0)
-        return free, touched, quality
+            sound = closure.penetration <= limits.penetration
+            quality[rows] = torch.where(sound, found, 0.0)
+            pose = self.object_T_frame[number] @ grasps.pose[rows].double()
+            held = self._capacity(pose, closure.joints, closure.contacts, closure.normals, number)
+            capacity[rows] = torch.where(sound, held.to(capacity), 0.0)
+        return Outcome(free, touched, quality, capacity)
+
+    def _capacity(
+        self,
+        object_T_base: Float[Tensor, "N 4 4"],
+        joints: Float[Tensor, "N J"],
+        contacts: Float[Tensor, "N F 3"],
+        normals: Float[Tensor, "N F 3"],
+        index: int,
+    ) -> Float[Tensor, "N"]:
+        """Return how many times the weight of an object closed grasps (its frame) hold; infinite where none asks."""
+        if self.up is None:
+            return torch.full((len(joints),), math.inf, dtype=torch.float64)
+        up = self.object_T_frame[index][:3, :3] @ self.up.double()
+        load = Load(friction=self.settings.friction, edges=self.settings.edges)
+        return load.capacity(self.closer.hand, self.bodies[index], object_T_base, joints, contacts, normals, up)
 
     def _closed(self, grasps: Grasps, index: int) -> "Closure":
         touching = grasps.touching
@@ -147,6 +193,8 @@ class Truth:
         quality = grasps.quality.new_zeros(len(grasps))
         if good.any():
             contacts, normals = closure.contacts[good].double(), closure.normals[good].double()
-            found = self._model(body).epsilon(contacts, normals, limits.epsilon).values
-            quality[good] = torch.as_tensor(found).to(quality)
+            found = torch.as_tensor(self._model(body).epsilon(contacts, normals, limits.epsilon).values)
+            pose = self.object_T_frame[index] @ grasps.pose[good].double()
+            held = self._capacity(pose, closure.joints[good], contacts, normals, index)
+            quality[good] = torch.where(held >= limits.capacity, found, 0.0).to(quality)
         return quality

@@ -46,17 +46,20 @@ class ScorerSettings:
     batch: int = 2048
     learning_rate: float = 0.004
     weight_decay: float = 0.01
-    clear: tuple[float, ...] = (0.06, 0.38, 0.80, 0.96)
-    blocked: tuple[float, ...] = (0.06, 0.27, 0.64, 0.78)
+    capacity: tuple[float, ...] = (0.5, 1.0, 2.0, 3.0, 5.0)
+    clear: tuple[float, ...] = (0.24, 0.26, 0.41, 0.78, 0.86, 0.91, 0.95)
+    blocked: tuple[float, ...] = (0.21, 0.27, 0.40, 0.63, 0.71, 0.72, 0.77)
 
     def __post_init__(self) -> None:
         for name in ("choices", "most", "per_view", "epochs", "batch"):
             if getattr(self, name) < 1:
                 raise DexgraspError(f"scorer.{name} of at least 1", str(getattr(self, name)), f"set scorer.{name}")
         for name in ("clear", "blocked"):
-            worth = getattr(self, name)
-            if len(worth) != 4 or not all(0 <= value <= 1 for value in worth):
-                raise DexgraspError(f"scorer.{name}: four shares in 0..1", str(worth), f"set scorer.{name}")
+            worth, wanted = getattr(self, name), len(self.capacity) + 2
+            if len(worth) != wanted or not all(0 <= value <= 1 for value in worth):
+                raise DexgraspError(f"scorer.{name}: {wanted} shares in 0..1", str(worth), f"set scorer.{name}")
+        if list(self.capacity) != sorted(self.capacity):
+            raise DexgraspError("scorer.capacity in ascending order", str(self.capacity), "set scorer.capacity")
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ class Proposals(Batch):
     worth: Float[Tensor, "N"]
     """How likely the grasp is to lift, by how it closes on the true object."""
     holds: Bool[Tensor, "N"]
-    """It is clear of everything and reaches the epsilon of synthesis."""
+    """It is clear of everything and holds so many times its weight as labels do, its own at least."""
 
 
 @dataclass(frozen=True)
@@ -176,12 +179,12 @@ def _of_view(path: Path, stamp: int, dataset: Dataset, index: int, settings: Sco
         rows = rows[passed][: settings.per_view]
         grasps, at = grasps[rows], rows % len(seeds)
         truth = scene_truth(dataset, dataset.scene_of(index), view.world_T_camera.double())
-        clear, touched, quality = truth.outcome(grasps)
-        least = truth.settings.epsilon
-        # 0: one finger or none, 1: several but no force closure, 2: force closure, 3: as good as synthesis asks for.
-        kind = (touched > 1).long() + (quality > 0) + (quality >= least)
-        worth = torch.where(clear, torch.tensor(settings.clear)[kind], torch.tensor(settings.blocked)[kind])
-        holds = clear & (quality >= least)
+        found = truth.outcome(grasps)
+        # 0: one finger or none; else by how many times its weight the object is held.
+        kind = 1 + torch.bucketize(found.capacity, torch.tensor(settings.capacity).to(found.capacity), right=True)
+        kind[found.touched < 2] = 0
+        worth = torch.where(found.clear, torch.tensor(settings.clear)[kind], torch.tensor(settings.blocked)[kind])
+        holds = found.clear & (found.capacity >= max(truth.settings.capacity, 1.0))
         around = surroundings(hand, grasps, coarse[:COARSE]).half()
         scores = grasps.quality
         return Proposals(features[at], cloud[seeds[at]], grasps.pose, grasps.joints, around, scores, worth, holds)
