@@ -149,17 +149,19 @@ def _farthest(xyz: np.ndarray, count: int) -> np.ndarray:
     """
     total = len(xyz)
     buckets = (total + _BUCKET - 1) // _BUCKET
-    low = np.empty((buckets, 3), np.float32)
-    high = np.empty((buckets, 3), np.float32)
+    low = np.empty((3, buckets), np.float32)
+    high = np.empty((3, buckets), np.float32)
     nearest = np.full(total, np.inf, np.float32)
     farthest = np.full(buckets, np.inf, np.float32)
-    best = np.empty(buckets, np.int64)
+    # Distances are not negative: their bits are in their order, and whole numbers are compared many at a time.
+    nearest_bits, farthest_bits = nearest.view(np.int32), farthest.view(np.int32)
+    best, apart = np.empty(buckets, np.int64), np.empty(buckets, np.float32)
     columns = np.empty((3, total), np.float32)
     for axis in range(3):
         columns[axis] = xyz[:, axis]
         for b in range(buckets):
             part = columns[axis, b * _BUCKET : (b + 1) * _BUCKET]
-            low[b, axis], high[b, axis] = part.min(), part.max()
+            low[axis, b], high[axis, b] = part.min(), part.max()
     middle = np.empty(3, np.float32)
     for axis in range(3):
         middle[axis] = (columns[axis].min() + columns[axis].max()) / np.float32(2)
@@ -175,22 +177,26 @@ def _farthest(xyz: np.ndarray, count: int) -> np.ndarray:
     for step in range(count):
         chosen[step] = current
         x, y, z = xyz[current, 0], xyz[current, 1], xyz[current, 2]
-        reach, following = np.float32(-1), 0
         for b in range(buckets):
-            dx = max(low[b, 0] - x, x - high[b, 0], zero)
-            dy = max(low[b, 1] - y, y - high[b, 1], zero)
-            dz = max(low[b, 2] - z, z - high[b, 2], zero)
-            if dx * dx + dy * dy + dz * dz < farthest[b]:
+            dx = max(low[0, b] - x, x - high[0, b], zero)
+            dy = max(low[1, b] - y, y - high[1, b], zero)
+            dz = max(low[2, b] - z, z - high[2, b], zero)
+            apart[b] = dx * dx + dy * dy + dz * dz
+        for b in range(buckets):
+            if apart[b] < farthest[b]:
                 start, stop = b * _BUCKET, min((b + 1) * _BUCKET, total)
                 for i in range(start, stop):
                     ex, ey, ez = columns[0, i] - x, columns[1, i] - y, columns[2, i] - z
                     nearest[i] = min(nearest[i], ex * ex + ey * ey + ez * ez)
-                most, where = np.float32(-1), start
+                most = nearest_bits[start:stop].max()
+                where = -1
                 for i in range(start, stop):
-                    if nearest[i] > most or (nearest[i] == most and _before(xyz, i, where)):
-                        most, where = nearest[i], i
-                farthest[b], best[b] = most, where
-            if farthest[b] > reach or (farthest[b] == reach and _before(xyz, best[b], following)):
-                reach, following = farthest[b], best[b]
-        current = following
+                    if nearest_bits[i] == most and (where < 0 or _before(xyz, i, where)):
+                        where = i
+                farthest_bits[b], best[b] = most, where
+        most = farthest_bits.max()
+        current = -1
+        for b in range(buckets):
+            if farthest_bits[b] == most and (current < 0 or _before(xyz, best[b], current)):
+                current = best[b]
     return chosen

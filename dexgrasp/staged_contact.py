@@ -230,7 +230,7 @@ class StagedContact(Representation):
         rows = contact_points(truth)
         if len(rows) < FEWEST:  # too few for batch statistics
             return outputs | self._tell(features, outputs["finger"], truth)
-        told = self._tell(features[rows], outputs["finger"][rows], truth[rows])
+        told = self._tell(features.index_select(0, rows), outputs["finger"].index_select(0, rows), truth[rows])
         return outputs | {
             name: value.new_zeros(len(features), *value.shape[1:]).index_copy(0, rows, value)
             for name, value in told.items()
@@ -321,12 +321,15 @@ class StagedContact(Representation):
         """
         known, contact = known_points(targets), contact_points(targets)
         classes = finger_loss(
-            prediction["finger"][known], targets.finger[known], none_weight=self.none_weight, focal=self.focal
+            prediction["finger"].index_select(0, known),
+            targets.finger[known],
+            none_weight=self.none_weight,
+            focal=self.focal,
         )
         truth, finger = targets.parameters[contact], targets.finger[contact] - 1
         told = self.main_slots + self.supporting_slots
         joint, kind = self.order[finger][:, told], self.kind[finger][:, told]
-        outputs = of_finger({name: value[contact] for name, value in prediction.items()}, finger)
+        outputs = of_finger({name: value.index_select(0, contact) for name, value in prediction.items()}, finger)
         logits, residuals = self._joint_outputs(outputs)
         joints = self.joints.loss(logits, residuals, truth[:, self.lead :][:, told], joint, huber=self.huber)
         anchor = self._anchor(truth)

@@ -32,7 +32,7 @@ def find_table(
     sampler = torch_stream(seed, "table")
     rows = cloud.double()
     sample = rows[torch.randperm(len(rows), generator=sampler)[:SAMPLE]]
-    points, normals = sample.split(3, dim=1)
+    points = sample[:, :3]
     triples = points[torch.randint(len(points), (TRIALS, 3), generator=sampler)]
     normal = torch.linalg.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     normal = torch.nn.functional.normalize(normal, dim=1)

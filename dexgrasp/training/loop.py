@@ -27,6 +27,7 @@ from dexgrasp.child import end_with_parent
 from dexgrasp.dataset.samples import Batch, Samples
 from dexgrasp.device import find_device
 from dexgrasp.errors import DexgraspError
+from dexgrasp.heap import keep_freed_memory
 from dexgrasp.model import GraspNet
 from dexgrasp.progress import track
 from dexgrasp.seeds import stream
@@ -118,6 +119,7 @@ def _run(
     stop: Any,
 ) -> None:
     """One process of the training; rank 0 writes."""
+    keep_freed_memory()
     if world > 1:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent tells us
         model = copy.deepcopy(model)  # what was sent here lies in memory that all processes share
