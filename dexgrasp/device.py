@@ -19,5 +19,6 @@ def find_device(name: str | torch.device, key: str) -> torch.device:
     if kind == "cuda" and not there:
         raise DexgraspError(f"a CUDA device for {key}={name}", "torch sees none", f"use {key}=cpu")
     if kind == "cuda" and int(number or 0) >= torch.cuda.device_count():
-        raise DexgraspError(f"a CUDA device for {key}={name}", f"{name} of {torch.cuda.device_count()}", "choose another")
+        many = torch.cuda.device_count()
+        raise DexgraspError(f"a CUDA device for {key}={name}", f"there are {many}, counted from 0", "choose another")
     return torch.device(name)

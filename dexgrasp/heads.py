@@ -28,8 +28,8 @@ class Layers(nn.Sequential):
         steps: list[nn.Module | tuple[Tensor, Tensor]] = []
         for layer, following in zip(self, [*list(self)[1:], None], strict=False):
             if isinstance(layer, nn.Linear):
-                normed = isinstance(following, nn.BatchNorm1d)
-                steps.append(_folded(layer, following) if normed else (layer.weight, layer.bias))
+                joined = _folded(layer, following) if isinstance(following, nn.BatchNorm1d) else None
+                steps.append(joined or (layer.weight, layer.bias))
             elif not isinstance(layer, nn.BatchNorm1d):
                 steps.append(layer)
         for rows in parts:
