@@ -68,9 +68,12 @@ class Scorer(nn.Module):
         """Return N logits; `at` is point (m) and normal where each grasp is told, level frame; `around` see below."""
         offset = (grasps.pose[:, :3, 3] - at[:, :3]) / REACH
         turned = grasps.pose[:, :3, :2].flatten(1)
-        whole = self.training or torch.compiler.is_compiling()
-        pieces = around.to(features).split(len(around) if whole else PIECE)  # that stay in the cache
-        near = torch.cat([self.around(part.flatten(0, 1)).unflatten(0, part.shape[:2]).amax(dim=1) for part in pieces])
+        each, rows = around.shape[1], around.to(features).flatten(0, 1)
+        if self.training or torch.compiler.is_compiling() or rows.device.type != "cpu":
+            near = self.around(rows).unflatten(0, (-1, each)).amax(dim=1)
+        else:
+            pieces = self.around.in_pieces(rows.split(PIECE * each))  # that stay in the cache
+            near = torch.cat([piece.unflatten(0, (-1, each)).amax(dim=1) for piece in pieces])
         seen = [features, near, offset, turned, at[:, 3:], at[:, 2:3] / REACH, grasps.joints]
         return self.layers(torch.cat([part.to(features) for part in seen], dim=1)).squeeze(1)
 
@@ -105,7 +108,7 @@ def platt(logits: Float[Tensor, "N"], came: Float[Tensor, "N"]) -> tuple[float, 
 
 def coarse_points(cloud: Float[Tensor, "N 6"], count: int = COARSE) -> Float[Tensor, "Q 6"]:
     """Return `count` points that are spread evenly over a cloud (farthest-point samples); more begin with fewer."""
-    return cloud[farthest_points(cloud[:, :3].cpu(), min(count, len(cloud))).to(cloud.device)]
+    return cloud[farthest_points(cloud[:, :3], min(count, len(cloud)))]
 
 
 def surroundings(hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"]) -> Float[Tensor, "N K 7"]:
