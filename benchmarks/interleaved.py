@@ -63,14 +63,16 @@ def compare(variants: Mapping[str, Callable[[], int]], rounds: int = 7, warm: in
     return Comparison(rates, seconds)
 
 
-def record(name: str, figures: Mapping[str, Any], path: str | Path | None) -> Path:
+def record(
+    name: str, figures: Mapping[str, Any], path: str | Path | None, clock: str = "CPU time of one process"
+) -> Path:
     """Write a benchmark's figures as JSON, with what they depend on, and return the file; default: <name>.json."""
     file = Path(path) if path else Path(f"{name}.json")
     about = {
         "schema": SCHEMA,
         "benchmark": name,
         "command": " ".join([f"python -m benchmarks.{name}", *sys.argv[1:]]),
-        "clock": "CPU time of one process",
+        "clock": clock,
         "machine": {"processor": _processor(), "cores": os.cpu_count(), "python": platform.python_version()},
         "packages": {package: version(package) for package in PACKAGES},
     }

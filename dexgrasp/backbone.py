@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
@@ -15,6 +16,8 @@ class Backbone(nn.Module, ABC):
 
     channels: int
     """Size C of a feature."""
+    farthest_first: bool = False
+    """Whether `seeds` are `farthest_points` of the cloud, in their order: then they serve others who need some, too."""
 
     @abstractmethod
     def plan(self, points: Float[Tensor, "N 3"]) -> Plan:
@@ -22,6 +25,11 @@ class Backbone(nn.Module, ABC):
 
         The result does not depend on the order of the points (up to their renaming).
         """
+
+    def plans(self, points: Float[Tensor, "B N 3"]) -> Plan:
+        """Return the stacked plans of a batch of clouds, on their device; here one by one, by `plan`."""
+        plans = [self.plan(cloud) for cloud in points]
+        return {name: torch.stack([plan[name] for plan in plans]).to(points.device) for name in plans[0]}
 
     @abstractmethod
     def forward(

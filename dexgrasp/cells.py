@@ -34,13 +34,11 @@ def make_cells(points: np.ndarray, side: float) -> Cells:
     """Sort points (N, 3) into cells of `side`, larger where 2^20 of them would not reach."""
     low = points.min(axis=0)
     side = max(side, float((points.max(axis=0) - low).max()) / (2**BITS - 4), 1e-12)
-    number = ((points - low) / side).astype(np.int64) + 1
-    key = (number[:, 0] << 2 * BITS) | (number[:, 1] << BITS) | number[:, 2]
-    order = np.argsort(key, kind="stable")
     slots = 1 << max(4, int(2 * len(points) - 1).bit_length())
     keys, starts, stops = np.full(slots, -1), np.zeros(slots, np.int64), np.zeros(slots, np.int64)
-    occupied = _fill(key[order], keys, starts, stops)
-    return Cells(np.ascontiguousarray(points[order].T, np.float64), order, keys, starts, stops, low, side, occupied)
+    sorted_points, order = np.empty((3, len(points))), np.empty(len(points), np.int64)
+    occupied = _fill(points.astype(np.float64), low.astype(np.float64), side, keys, starts, stops, sorted_points, order)
+    return Cells(sorted_points, order, keys, starts, stops, low, side, occupied)
 
 
 @njit(cache=True)
@@ -54,12 +52,34 @@ def find_cell(keys: np.ndarray, key: int) -> int:
 
 
 @njit(cache=True)
-def _fill(sorted_keys: np.ndarray, keys: np.ndarray, starts: np.ndarray, stops: np.ndarray) -> int:
-    occupied = 0
-    for i in range(len(sorted_keys)):
-        slot = find_cell(keys, sorted_keys[i])
-        if keys[slot] < 0:
-            keys[slot], starts[slot] = sorted_keys[i], i
-            occupied += 1
-        stops[slot] = i + 1
+def _fill(
+    points: np.ndarray,
+    low: np.ndarray,
+    side: float,
+    keys: np.ndarray,
+    starts: np.ndarray,
+    stops: np.ndarray,
+    sorted_points: np.ndarray,
+    order: np.ndarray,
+) -> int:
+    """Fill the table and sort the points by counting; points of one cell stay in order."""
+    occupied, slots = 0, np.empty(len(points), np.int64)
+    for i in range(len(points)):
+        a, b, c = (points[i, 0] - low[0]) / side, (points[i, 1] - low[1]) / side, (points[i, 2] - low[2]) / side
+        key = ((int(a) + 1) << 2 * BITS) | ((int(b) + 1) << BITS) | (int(c) + 1)
+        slot = find_cell(keys, key)
+        occupied += keys[slot] < 0
+        keys[slot], slots[i] = key, slot
+        stops[slot] += 1
+    total = 0
+    for slot in range(len(keys)):
+        starts[slot] = total
+        total += stops[slot]
+        stops[slot] = starts[slot]
+    for i in range(len(points)):
+        place = stops[slots[i]]
+        stops[slots[i]] += 1
+        order[place] = i
+        for axis in range(3):
+            sorted_points[axis, place] = points[i, axis]
     return occupied

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,15 @@ from dexgrasp.checkpoint import (
     write_tensors,
 )
 from dexgrasp.cloud import prepare
+from dexgrasp.device import find_device
+from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import inverse
+from dexgrasp.graph import Captured
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.level import carried, level_frame
 from dexgrasp.representation import Prediction, Representation, Targets
-from dexgrasp.scorer import Scorer, coarse_points, surroundings
+from dexgrasp.scorer import COARSE, Scorer, coarse_points, surroundings
 from dexgrasp.selection import Selection, select
 from dexgrasp.table import find_table
 
@@ -45,6 +49,10 @@ class GraspNet(nn.Module):
     """
 
     scorer: Scorer | None
+    precision: str
+    """Of the backbone in prediction: float32 or bfloat16 (autocast)."""
+    captured: Captured | None
+    """What `propose` leaves a cloud without indices to: a CUDA graph."""
 
     def __init__(
         self,
@@ -58,6 +66,7 @@ class GraspNet(nn.Module):
         self.points, self.config = points, dict(config or {})
         self.selection = Selection()
         self.scorer = None
+        self.precision, self.captured = "float32", None
 
     @property
     def hand(self) -> Hand:
@@ -78,7 +87,10 @@ class GraspNet(nn.Module):
         self, cloud: Float[Tensor, "B N 6"], plan: Plan | None
     ) -> tuple[Float[Tensor, "B M C"], Int[Tensor, "B M"]]:
         middle = cloud.mean(dim=1, keepdim=True) * cloud.new_tensor([1, 1, 0, 0, 0, 0])
-        return self.backbone(cloud - middle, plan)
+        half = self.precision == "bfloat16" and not self.training
+        with torch.autocast(cloud.device.type, torch.bfloat16) if half else nullcontext():
+            features, seeds = self.backbone(cloud - middle, plan)
+        return features.float() if half else features, seeds
 
     @torch.no_grad()
     def told(
@@ -89,21 +101,27 @@ class GraspNet(nn.Module):
         One set for each of `choices` answers, at most as many as the representation can give; at the `most` seeds that
         the heads think most graspable, None: all.
         """
+        rows, chosen, grasps = self._told(cloud, plan, choices, most)[:3]
+        return rows, chosen, [grasps[start : start + len(rows)] for start in range(0, len(grasps), len(rows))]
+
+    def _told(
+        self, cloud: Float[Tensor, "N 6"], plan: Plan | None, choices: int, most: int | None
+    ) -> tuple[Float[Tensor, "M C"], Int[Tensor, "M"], Grasps, Int[Tensor, "S"]]:
+        """Return the same, all answers in one, one after the other; and all seeds."""
         training = self.training
-        self.eval()
+        if training:
+            self.eval()
         one = None if plan is None else {key: row[None] for key, row in plan.items()}
         features, seeds = self._features(cloud[None], one)
-        rows, chosen = features[0], seeds[0]
+        rows, chosen, count = features[0], seeds[0], max(1, min(choices, self.representation.choices))
         if most is not None and most < len(rows):
             best = self.representation.graspable(rows).topk(most).indices
             rows, chosen = rows[best], chosen[best]
-        points, normals = cloud[chosen].split(3, dim=1)
-        grasps = [
-            self.representation.decode(points, normals, self.representation(rows, choice=choice))
-            for choice in range(max(1, min(choices, self.representation.choices)))
-        ]
-        self.train(training)
-        return rows, chosen, grasps
+        points, normals = cloud[chosen].repeat(count, 1).split(3, dim=1)
+        grasps = self.representation.decode(points, normals, self.representation.answers(rows, count))
+        if training:
+            self.train()
+        return rows, chosen, grasps, seeds[0]
 
     @torch.no_grad()
     def propose(
@@ -114,13 +132,24 @@ class GraspNet(nn.Module):
         One per seed, or as many as the scorer is used to choosing from. `plan` and `coarse` (rows of `coarse_points`,
         for a scorer) are found here where None.
         """
+        captured = self.captured if plan is None else None
+        return self.launch(cloud, plan, coarse) if captured is None else captured(cloud)
+
+    @torch.no_grad()
+    def launch(
+        self, cloud: Float[Tensor, "N 6"], plan: Plan | None = None, coarse: Int[Tensor, "Q"] | None = None
+    ) -> Grasps:
+        """Return the same as `propose`, launched step by step."""
         if self.scorer is None:
             return self.told(cloud, plan)[2][0]
-        scorer = self.scorer.eval()
-        features, seeds, grasps = self.told(cloud, plan, scorer.choices, scorer.most)
-        at, spread = cloud[seeds], coarse_points(cloud) if coarse is None else cloud[coarse]
-        logits = [scorer(features, at, told, surroundings(self.hand, told, spread)) for told in grasps]
-        return Grasps.cat([told.replace(quality=logit.sigmoid()) for told, logit in zip(grasps, logits, strict=True)])
+        scorer = self.scorer.eval() if self.scorer.training else self.scorer
+        features, seeds, grasps, every = self._told(cloud, plan, scorer.choices, scorer.most)
+        answers = len(grasps) // len(seeds)
+        if coarse is None and self.backbone.farthest_first and len(every) >= min(COARSE, len(cloud)):
+            coarse = every[:COARSE]
+        spread = coarse_points(cloud) if coarse is None else cloud[coarse]
+        features, at = features.repeat(answers, 1), cloud[seeds].repeat(answers, 1)
+        return grasps.replace(quality=scorer(features, at, grasps, surroundings(self.hand, grasps, spread)).sigmoid())
 
     def predict(
         self,
@@ -177,17 +206,29 @@ def save_model(path: Path, model: GraspNet, facts: Mapping[str, Any] | None = No
     replace_file(path.with_suffix(".json"), (json.dumps(notes, indent=2) + "\n").encode())
 
 
-def load_model(name_or_path: str | Path, hand: Hand | None = None, device: str | torch.device = "cpu") -> GraspNet:
+def load_model(
+    name_or_path: str | Path,
+    hand: Hand | None = None,
+    device: str | torch.device = "cpu",
+    precision: str = "float32",
+    captured: bool = False,
+) -> GraspNet:
     """Return a trained network in eval mode.
 
     Args:
         name_or_path: a checkpoint, the folder of a training, or the name of shipped weights.
         hand: the hand it shall serve; the one of the checkpoint where None.
-        device: where the network runs.
+        device: where the network runs: cpu, cuda, cuda:1, or auto, which is CUDA where there is one.
+        precision: float32 or bfloat16, in which the backbone then runs (autocast).
+        captured: predict by a CUDA graph, see `dexgrasp.graph`.
 
     Raises:
-        DexgraspError: no such checkpoint, truncated, of another hand, or of another version of a plugin.
+        DexgraspError: no such device or precision; no such checkpoint, truncated, of another hand, or of another
+            version of a plugin.
     """
+    where = find_device(device, "device")
+    if precision not in ("float32", "bfloat16"):
+        raise DexgraspError("precision float32 or bfloat16", repr(precision), "choose one of the two")
     path = find_checkpoint(name_or_path)
     tensors, notes = read_tensors(path)
     if hand is not None:
@@ -197,4 +238,5 @@ def load_model(name_or_path: str | Path, hand: Hand | None = None, device: str |
     if notes.get("scorer") is not None:
         model.scorer = Scorer(model.hand, model.backbone.channels, **notes["scorer"])
     load_state(model, tensors, path)
-    return model.to(device).eval()
+    model.precision, model.captured = precision, Captured(model) if captured else None
+    return model.to(where).eval()

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
@@ -77,6 +78,11 @@ class Representation(nn.Module, ABC):
         In training, `truth` is what the points are labelled with: heads that build on the answers of earlier heads may
         build on the true ones there (teacher forcing). Without it, they build on their own.
         """
+
+    def answers(self, features: Float[Tensor, "N C"], count: int) -> Prediction:
+        """Return the first `count` choices, in evaluation: all points' first, then all points' second, ..."""
+        each = [self(features, choice=choice) for choice in range(count)]
+        return {name: torch.cat([outputs[name] for outputs in each]) for name in each[0]}
 
     def graspable(self, features: Float[Tensor, "N C"]) -> Float[Tensor, "N"]:
         """Return, for each point, a number that grows with the score that `decode` gives; cheaper where one head tells.

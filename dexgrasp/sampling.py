@@ -1,6 +1,7 @@
-"""Farthest point sampling and neighbours of a cloud, on the CPU, independent of the order of its points.
+"""Farthest point sampling and neighbours of a cloud, independent of the order of its points.
 
-Each function has a pure-torch reference of the same result, for tests and for other devices.
+The points' device decides how: compiled on the CPU, by `dexgrasp.kernels` on CUDA where Triton is. Each function has a
+pure-torch reference of the same result, for tests. Indices lie where the points lie.
 """
 
 import numpy as np
@@ -9,6 +10,10 @@ from jaxtyping import Float, Int
 from numba import njit
 from scipy.spatial import cKDTree
 from torch import Tensor
+
+from dexgrasp import kernels
+from dexgrasp.borrow import borrowed
+from dexgrasp.cells import BITS, Cells, find_cell, make_cells
 
 _BUCKET = 64
 """Points per bucket: below it the tests of the boxes dominate, above it the distances."""
@@ -20,9 +25,11 @@ def farthest_points(points: Float[Tensor, "N 3"], count: int) -> Int[Tensor, "co
     The first is the point farthest from the middle of the bounding box; equal distances are decided by x, then y,
     then z. More points than there are repeat the first in that order.
     """
+    if kernels.usable(points):
+        return kernels.arrange(points[None]).farthest(count)[0]
     xyz = np.ascontiguousarray(points.detach().cpu().numpy(), dtype=np.float32)
     order = np.argsort(morton(xyz), kind="stable")
-    return torch.from_numpy(order[_farthest(xyz[order], count)])
+    return torch.from_numpy(order[_farthest(xyz[order], count)]).to(points.device)
 
 
 def farthest_points_reference(points: Float[Tensor, "N 3"], count: int) -> Int[Tensor, "count"]:
@@ -43,15 +50,20 @@ def neighbours(
 ) -> Int[Tensor, "M count"]:
     """Return the nearest `count` points within `radius` (m) of each centre, nearest first.
 
-    Where there are fewer, the nearest is repeated (also when it lies outside).
+    Where there are fewer, the nearest is repeated (also when it lies outside). Which of equal distances comes first is
+    left open on the CPU; on CUDA, x decides, then y, then z.
     """
-    tree = cKDTree(points.detach().cpu().numpy(), balanced_tree=False, compact_nodes=False)
-    query = centres.detach().cpu().numpy()
-    index = tree.query(query, k=range(1, count + 1), distance_upper_bound=radius)[1]
-    lonely = index[:, 0] == tree.n
+    if kernels.usable(points):
+        return kernels.arrange(points[None]).nearest(centres[None], count, radius)[0]
+    cloud, query = (part.detach().cpu().double().numpy() for part in (points, centres))
+    if radius == float("inf"):
+        index = cKDTree(cloud, balanced_tree=False, compact_nodes=False).query(query, k=range(1, count + 1))[1]
+        return torch.from_numpy(np.where(index == len(cloud), index[:, :1], index)).to(points.device)
+    index = _in_ball(make_cells(cloud, radius), query, count, radius)
+    lonely = index[:, 0] < 0
     if lonely.any():
-        index[lonely, 0] = tree.query(query[lonely])[1]
-    return torch.from_numpy(np.where(index == tree.n, index[:, :1], index))
+        index[lonely] = cKDTree(cloud).query(query[lonely])[1][:, None]
+    return torch.from_numpy(index).to(points.device)
 
 
 def neighbours_reference(
@@ -62,6 +74,48 @@ def neighbours_reference(
     distance, index = table.topk(min(count, len(points)), dim=1, largest=False)
     index = torch.where(distance < radius, index, index[:, :1])
     return torch.cat([index, index[:, :1].expand(-1, count - index.shape[1])], dim=1)
+
+
+@njit(cache=True)
+def _in_ball(cells: Cells, centres: np.ndarray, count: int, radius: float) -> np.ndarray:
+    """Return `neighbours` of centres (M, 3), from the cells about each; -1 where there are none."""
+    cells, centres = borrowed(cells), borrowed(centres)
+    low, side = cells.low, cells.side
+    px, py, pz = cells.points
+    index = np.empty((len(centres), count), np.int64)
+    near, apart = np.empty(len(px), np.int64), np.empty(len(px))
+    best = np.empty(count)
+    for m in range(len(centres)):
+        x, y, z = centres[m]
+        i, j, k = int((x - low[0]) / side) + 1, int((y - low[1]) / side) + 1, int((z - low[2]) / side) + 1
+        total, found = 0, 0
+        for a in range(i - 1, i + 2):
+            for b in range(j - 1, j + 2):
+                for c in range(k - 1, k + 2):
+                    key = (a << 2 * BITS) | (b << BITS) | c
+                    slot = find_cell(cells.keys, key)
+                    if cells.keys[slot] != key:
+                        continue
+                    start = cells.starts[slot]
+                    for n in range(cells.stops[slot] - start):
+                        u, v, w = px[start + n] - x, py[start + n] - y, pz[start + n] - z
+                        near[total + n], apart[total + n] = start + n, u * u + v * v + w * w
+                    total += cells.stops[slot] - start
+        limit = radius * radius
+        for n in range(total):
+            d = apart[n]
+            if d >= limit:
+                continue
+            place = min(found, count - 1)
+            while place > 0 and best[place - 1] > d:
+                best[place], index[m, place] = best[place - 1], index[m, place - 1]
+                place -= 1
+            best[place], index[m, place] = d, cells.order[near[n]]
+            found = min(found + 1, count)
+            if found == count:
+                limit = best[count - 1]
+        index[m, found:] = index[m, 0] if found else -1
+    return index
 
 
 def _squared(vectors: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
@@ -95,17 +149,19 @@ def _farthest(xyz: np.ndarray, count: int) -> np.ndarray:
     """
     total = len(xyz)
     buckets = (total + _BUCKET - 1) // _BUCKET
-    low = np.empty((buckets, 3), np.float32)
-    high = np.empty((buckets, 3), np.float32)
+    low = np.empty((3, buckets), np.float32)
+    high = np.empty((3, buckets), np.float32)
     nearest = np.full(total, np.inf, np.float32)
     farthest = np.full(buckets, np.inf, np.float32)
-    best = np.empty(buckets, np.int64)
+    # Distances are not negative: their bits are in their order, and whole numbers are compared many at a time.
+    nearest_bits, farthest_bits = nearest.view(np.int32), farthest.view(np.int32)
+    best, apart = np.empty(buckets, np.int64), np.empty(buckets, np.float32)
     columns = np.empty((3, total), np.float32)
     for axis in range(3):
         columns[axis] = xyz[:, axis]
         for b in range(buckets):
             part = columns[axis, b * _BUCKET : (b + 1) * _BUCKET]
-            low[b, axis], high[b, axis] = part.min(), part.max()
+            low[axis, b], high[axis, b] = part.min(), part.max()
     middle = np.empty(3, np.float32)
     for axis in range(3):
         middle[axis] = (columns[axis].min() + columns[axis].max()) / np.float32(2)
@@ -121,22 +177,26 @@ def _farthest(xyz: np.ndarray, count: int) -> np.ndarray:
     for step in range(count):
         chosen[step] = current
         x, y, z = xyz[current, 0], xyz[current, 1], xyz[current, 2]
-        reach, following = np.float32(-1), 0
         for b in range(buckets):
-            dx = max(low[b, 0] - x, x - high[b, 0], zero)
-            dy = max(low[b, 1] - y, y - high[b, 1], zero)
-            dz = max(low[b, 2] - z, z - high[b, 2], zero)
-            if dx * dx + dy * dy + dz * dz < farthest[b]:
+            dx = max(low[0, b] - x, x - high[0, b], zero)
+            dy = max(low[1, b] - y, y - high[1, b], zero)
+            dz = max(low[2, b] - z, z - high[2, b], zero)
+            apart[b] = dx * dx + dy * dy + dz * dz
+        for b in range(buckets):
+            if apart[b] < farthest[b]:
                 start, stop = b * _BUCKET, min((b + 1) * _BUCKET, total)
                 for i in range(start, stop):
                     ex, ey, ez = columns[0, i] - x, columns[1, i] - y, columns[2, i] - z
                     nearest[i] = min(nearest[i], ex * ex + ey * ey + ez * ez)
-                most, where = np.float32(-1), start
+                most = nearest_bits[start:stop].max()
+                where = -1
                 for i in range(start, stop):
-                    if nearest[i] > most or (nearest[i] == most and _before(xyz, i, where)):
-                        most, where = nearest[i], i
-                farthest[b], best[b] = most, where
-            if farthest[b] > reach or (farthest[b] == reach and _before(xyz, best[b], following)):
-                reach, following = farthest[b], best[b]
-        current = following
+                    if nearest_bits[i] == most and (where < 0 or _before(xyz, i, where)):
+                        where = i
+                farthest_bits[b], best[b] = most, where
+        most = farthest_bits.max()
+        current = -1
+        for b in range(buckets):
+            if farthest_bits[b] == most and (current < 0 or _before(xyz, best[b], current)):
+                current = best[b]
     return chosen

@@ -68,16 +68,47 @@ class Scorer(nn.Module):
         """Return N logits; `at` is point (m) and normal where each grasp is told, level frame; `around` see below."""
         offset = (grasps.pose[:, :3, 3] - at[:, :3]) / REACH
         turned = grasps.pose[:, :3, :2].flatten(1)
-        whole = self.training or torch.compiler.is_compiling()
-        pieces = around.to(features).split(len(around) if whole else PIECE)  # that stay in the cache
-        near = torch.cat([self.around(part.flatten(0, 1)).unflatten(0, part.shape[:2]).amax(dim=1) for part in pieces])
+        each, rows = around.shape[1], around.to(features).flatten(0, 1)
+        if self.training or torch.compiler.is_compiling() or rows.device.type != "cpu":
+            near = self.around(rows).unflatten(0, (-1, each)).amax(dim=1)
+        else:
+            pieces = self.around.in_pieces(rows.split(PIECE * each))  # that stay in the cache
+            near = torch.cat([piece.unflatten(0, (-1, each)).amax(dim=1) for piece in pieces])
         seen = [features, near, offset, turned, at[:, 3:], at[:, 2:3] / REACH, grasps.joints]
         return self.layers(torch.cat([part.to(features) for part in seen], dim=1)).squeeze(1)
+
+    @torch.no_grad()
+    def calibrate(self, logits: Float[Tensor, "N"], came: Float[Tensor, "N"]) -> None:
+        """Make what is told come true (1 or 0) as often as it says, by `platt`; the order of grasps stays."""
+        slope, shift = platt(logits, came)
+        last = self.layers[-1]
+        assert isinstance(last, nn.Linear)
+        last.weight.mul_(slope)
+        last.bias.mul_(slope).add_(shift)
+
+
+def platt(logits: Float[Tensor, "N"], came: Float[Tensor, "N"]) -> tuple[float, float]:
+    """Return slope (positive) and shift that turn logits into those of probabilities that come true (Platt 1999).
+
+    Newton's method on the likelihood of slope * logit + shift, with one success and one failure more at a logit of 0
+    so that it has an end where all come true.
+    """
+    x = torch.cat([logits.double(), logits.new_zeros(2).double()])
+    y = torch.cat([came.double(), torch.tensor([0.0, 1.0], dtype=torch.float64)])
+    design, found = torch.stack([x, torch.ones_like(x)], dim=1), torch.tensor([1.0, 0.0], dtype=torch.float64)
+    for _ in range(50):
+        told = (design @ found).sigmoid()
+        curved = design.T @ (design * (told * (1 - told))[:, None]) + 1e-6 * torch.eye(2, dtype=torch.float64)
+        step = torch.linalg.solve(curved, design.T @ (y - told))
+        found = found + step.clamp(-1, 1)
+        if step.abs().max() < 1e-9:
+            break
+    return max(float(found[0]), 1e-3), float(found[1])
 
 
 def coarse_points(cloud: Float[Tensor, "N 6"], count: int = COARSE) -> Float[Tensor, "Q 6"]:
     """Return `count` points that are spread evenly over a cloud (farthest-point samples); more begin with fewer."""
-    return cloud[farthest_points(cloud[:, :3].cpu(), min(count, len(cloud))).to(cloud.device)]
+    return cloud[farthest_points(cloud[:, :3], min(count, len(cloud)))]
 
 
 def surroundings(hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"]) -> Float[Tensor, "N K 7"]:

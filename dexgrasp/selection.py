@@ -93,23 +93,21 @@ def free(
     """
     passed = torch.ones(len(grasps), dtype=torch.bool)
     points = points if isinstance(points, Blocks) else in_blocks(points)
+    away, joints = pregrasp(hand, grasps, 1.0, selection.opening)
+    steps = torch.linspace(0.0, selection.retreat, max(1, selection.steps)).to(away)
+    way = grasps.pose + steps[:, None, None, None] * (away - grasps.pose)  # (steps, N, 4, 4): moved, not turned
     if table is not None and selection.table is not None:
-        motion = table.to(grasps.pose)
-        passed &= torch.as_tensor(shape.table_distance(motion @ grasps.pose, grasps.joints)) >= -selection.table
-    for step in range(selection.steps):
-        retreat = selection.retreat * step / max(1, selection.steps - 1)
-        alive = passed.nonzero().flatten()
-        if len(alive) == 0:
-            break
-        pose, joints = pregrasp(hand, grasps[alive], retreat, selection.opening)
-        good = torch.ones(len(alive), dtype=torch.bool)
-        if table is not None and selection.table is not None:
-            good &= torch.as_tensor(shape.table_distance(motion @ pose, joints)) >= -selection.table
-        if selection.depth is not None and good.any():
-            rows = good.nonzero().flatten()
-            depth = shape.cloud_depth(points, pose[rows], joints[rows], enough=selection.depth)
-            good[rows] = torch.as_tensor(depth) <= selection.depth
-        passed[alive] = good
+        motion, both = table.to(away), torch.stack([grasps.joints, *[joints] * len(steps)])
+        places = motion @ torch.cat([grasps.pose[None], way])
+        height = torch.as_tensor(shape.table_distance(places.flatten(0, 1), both.flatten(0, 1)))
+        passed &= (height.unflatten(0, places.shape[:2]) >= -selection.table).all(dim=0)
+    if selection.depth is not None:
+        # Most that meet something do so where they grasp: the rest of the way is looked at for the others only.
+        for places in (way[:1], way[1:]):
+            rows = passed.nonzero().flatten()
+            tried, opened = places[:, rows].flatten(0, 1), joints[rows].repeat(len(places), 1)
+            depth = torch.as_tensor(shape.cloud_depth(points, tried, opened, enough=selection.depth))
+            passed[rows] = (depth.reshape(len(places), len(rows)) <= selection.depth).all(dim=0)
     return passed
 
 

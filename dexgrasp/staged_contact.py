@@ -226,24 +226,34 @@ class StagedContact(Representation):
         """
         outputs = self.stages["finger"](features)
         if truth is None:
-            return outputs | self._tell(features, outputs["finger"], None, choice)
+            return outputs | self._tell(features, outputs["finger"], None, (choice,))
         rows = contact_points(truth)
         if len(rows) < FEWEST:  # too few for batch statistics
             return outputs | self._tell(features, outputs["finger"], truth)
-        told = self._tell(features[rows], outputs["finger"][rows], truth[rows])
+        told = self._tell(features.index_select(0, rows), outputs["finger"].index_select(0, rows), truth[rows])
         return outputs | {
             name: value.new_zeros(len(features), *value.shape[1:]).index_copy(0, rows, value)
             for name, value in told.items()
         }
+
+    def answers(self, features: Float[Tensor, "N C"], count: int) -> Prediction:
+        """Return the first `count` choices; what does not depend on the anchor is found once."""
+        outputs = self.stages["finger"](features)
+        told = self._tell(features, outputs["finger"], None, range(count))
+        return {"finger": outputs["finger"].repeat(count, 1)} | told
 
     def graspable(self, features: Float[Tensor, "N C"]) -> Float[Tensor, "N"]:
         """Return the logit of the score, from the first head alone."""
         return any_finger(self.stages["finger"](features)["finger"])
 
     def _tell(
-        self, features: Float[Tensor, "N C"], classes: Float[Tensor, "N K"], truth: Targets | None, choice: int = 0
+        self,
+        features: Float[Tensor, "N C"],
+        classes: Float[Tensor, "N K"],
+        truth: Targets | None,
+        choices: Sequence[int] = (0,),
     ) -> Prediction:
-        """Run stages 2 and 3, head by head, each knowing what was decided before it."""
+        """Run stages 2 and 3, head by head, each knowing what was decided before it; (choices * N, ...)."""
         finger = classes[:, 1:].argmax(-1)
         if truth is not None:
             finger = torch.where(truth.finger > 0, truth.finger - 1, finger)
@@ -258,8 +268,13 @@ class StagedContact(Representation):
             shapes = {"projection": (len(self.anchors), 1 + self.told), "touching": (self.fingers,)}
             shape = shapes[name] if name in shapes else (len(self.slots[name]), 2, self.joints.most)
             shaped[name] = raw[name].unflatten(-1, (self.versions, *shape))
-            if name == "projection" and choice:
-                shaped[name] = _without_likeliest(shaped[name], choice)
+            if name == "projection":
+                every = [_without_likeliest(shaped[name], choice) if choice else shaped[name] for choice in choices]
+                shaped[name] = torch.cat(every)
+                if len(every) > 1:
+                    features, finger = features.repeat(len(every), 1), finger.repeat(len(every))
+                    known = [part.repeat(len(every), 1) for part in known]
+                    raw = {head: value.repeat(len(every), 1) for head, value in raw.items()}
             if self.conditioned and name != "supporting":
                 known.append(self._decided(name, shaped[name], finger, truth))
         position = [(self.first_slots + self.second_slots).index(slot) for slot in self.main_slots]
@@ -306,12 +321,15 @@ class StagedContact(Representation):
         """
         known, contact = known_points(targets), contact_points(targets)
         classes = finger_loss(
-            prediction["finger"][known], targets.finger[known], none_weight=self.none_weight, focal=self.focal
+            prediction["finger"].index_select(0, known),
+            targets.finger[known],
+            none_weight=self.none_weight,
+            focal=self.focal,
         )
         truth, finger = targets.parameters[contact], targets.finger[contact] - 1
         told = self.main_slots + self.supporting_slots
         joint, kind = self.order[finger][:, told], self.kind[finger][:, told]
-        outputs = of_finger({name: value[contact] for name, value in prediction.items()}, finger)
+        outputs = of_finger({name: value.index_select(0, contact) for name, value in prediction.items()}, finger)
         logits, residuals = self._joint_outputs(outputs)
         joints = self.joints.loss(logits, residuals, truth[:, self.lead :][:, told], joint, huber=self.huber)
         anchor = self._anchor(truth)

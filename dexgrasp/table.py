@@ -1,7 +1,9 @@
 """The plane on which a scene stands, found in its cloud: what the camera cannot see of it is solid all the same."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numba import njit
 from torch import Tensor
 
 from dexgrasp.geometry import pose
@@ -30,42 +32,95 @@ def find_table(
     sampler = torch_stream(seed, "table")
     rows = cloud.double()
     sample = rows[torch.randperm(len(rows), generator=sampler)[:SAMPLE]]
-    points, normals = sample.split(3, dim=1)
+    points = sample[:, :3]
     triples = points[torch.randint(len(points), (TRIALS, 3), generator=sampler)]
     normal = torch.linalg.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     normal = torch.nn.functional.normalize(normal, dim=1)
     offset = -(normal * triples[:, 0]).sum(1)
     normal, offset = torch.where(offset[:, None] < 0, -normal, normal), offset.abs()  # the camera is above
-    height = points @ normal.T + offset
-    on = (height.abs() < tolerance) & (normals @ normal.T > 0.9)
-    support = on.double().mean(0)
-    proper = (height < -0.01).double().mean(0) <= below
-    proper &= (height > 0.01).double().mean(0) >= above
-    support = torch.where(proper, support, torch.zeros_like(support))
+    columns = np.ascontiguousarray(sample.float().numpy().T)
+    counts = _count(columns, torch.column_stack([normal, offset]).float().numpy(), tolerance)
+    on, behind, before = torch.from_numpy(counts / len(sample)).T
+    support = torch.where((behind <= below) & (before >= above), on, 0.0)
     best = int(support.argmax())
     if support[best] < share:
         return None
     return _refined(rows, normal[best], offset[best], tolerance)
 
 
+@njit(cache=True)
+def _count(rows: np.ndarray, planes: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return (K, 3): points on each plane with agreeing normals, and more than 1 cm behind and before it.
+
+    `rows` (6, P) are positions and normals, `planes` (K, 4) normal and offset; float32.
+    """
+    counts = np.empty((len(planes), 3))
+    px, py, pz, nx, ny, nz = rows
+    near, apart = np.float32(tolerance), np.float32(0.01)
+    for k in range(len(planes)):
+        a, b, c, d = planes[k]
+        on, behind, before = np.int32(0), np.int32(0), np.int32(0)
+        for i in range(len(px)):
+            height = a * px[i] + b * py[i] + c * pz[i] + d
+            along = a * nx[i] + b * ny[i] + c * nz[i]
+            on += np.int32((abs(height) < near) & (along > np.float32(0.9)))
+            behind += np.int32(height < -apart)
+            before += np.int32(height > apart)
+        counts[k, 0], counts[k, 1], counts[k, 2] = on, behind, before
+    return counts
+
+
 def _refined(
     rows: Float[Tensor, "N 6"], up: Float[Tensor, "3"], offset: Tensor, tolerance: float, rounds: int = 4
 ) -> Float[Tensor, "4 4"]:
     """Fit the plane to all points near it, in a band that narrows down to the noise: feet of objects tilt it."""
-    points, normals = rows.split(3, dim=1)
-    band = tolerance
+    plane = np.append(up.numpy(), float(offset))
+    _narrow(rows.contiguous().numpy(), plane, tolerance, rounds)
+    found = torch.from_numpy(plane)
+    return _frame(found[:3], -found[3] * found[:3])
+
+
+@njit(cache=True)
+def _narrow(rows: np.ndarray, plane: np.ndarray, tolerance: float, rounds: int) -> None:
+    """Fit `plane`, normal and offset, in place."""
+    band, near, apart = tolerance, np.empty(len(rows), np.int64), np.empty(len(rows))
+    spread, sums = np.empty((3, 3)), np.empty(9)
     for _ in range(rounds):
-        height = points @ up + offset
-        near = points[(height.abs() < band) & (normals @ up > 0.9)]
-        if len(near) < 3:
+        a, b, c, d = plane
+        count, sums[:] = 0, 0.0
+        for i in range(len(rows)):
+            x, y, z = rows[i, 0], rows[i, 1], rows[i, 2]
+            if abs(a * x + b * y + c * z + d) < band and a * rows[i, 3] + b * rows[i, 4] + c * rows[i, 5] > 0.9:
+                near[count] = i
+                count += 1
+                x, y, z = x + d * a, y + d * b, z + d * c  # about a point of the plane: little cancels
+                sums[0], sums[1], sums[2] = sums[0] + x, sums[1] + y, sums[2] + z
+                sums[3], sums[4], sums[5] = sums[3] + x * x, sums[4] + x * y, sums[5] + x * z
+                sums[6], sums[7], sums[8] = sums[6] + y * y, sums[7] + y * z, sums[8] + z * z
+        if count < 3:
             break
-        centre = near.mean(0)
-        axis = torch.linalg.svd(near - centre, full_matrices=False).Vh[2]
-        up = axis if axis @ up > 0 else -axis
-        offset = -(up @ centre)
-        spread = (near @ up + offset).abs().median()
-        band = min(tolerance, max(0.002, 3 * float(spread)))
-    return _frame(up, -offset * up)
+        x, y, z = sums[0] / count, sums[1] / count, sums[2] / count
+        spread[0, 0], spread[0, 1], spread[0, 2] = (
+            sums[3] - count * x * x,
+            sums[4] - count * x * y,
+            sums[5] - count * x * z,
+        )
+        spread[1, 1], spread[1, 2], spread[2, 2] = (
+            sums[6] - count * y * y,
+            sums[7] - count * y * z,
+            sums[8] - count * z * z,
+        )
+        spread[1, 0], spread[2, 0], spread[2, 1] = spread[0, 1], spread[0, 2], spread[1, 2]
+        axis = np.linalg.eigh(spread)[1][:, 0]
+        sign = 1.0 if axis[0] * a + axis[1] * b + axis[2] * c > 0 else -1.0
+        x, y, z = x - d * a, y - d * b, z - d * c
+        a, b, c = sign * axis[0], sign * axis[1], sign * axis[2]
+        d = -(a * x + b * y + c * z)
+        plane[0], plane[1], plane[2], plane[3] = a, b, c, d
+        for n in range(count):
+            i = near[n]
+            apart[n] = abs(a * rows[i, 0] + b * rows[i, 1] + c * rows[i, 2] + d)
+        band = min(tolerance, max(0.002, 3 * np.median(apart[:count])))
 
 
 def _frame(up: Float[Tensor, "3"], origin: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:

@@ -29,6 +29,8 @@ from dexgrasp.hand import Finger, Hand  # noqa: E402
 from dexgrasp.plugins import load_hand  # noqa: E402
 
 torch.set_num_threads(1)
+if not torch.cuda.is_available():  # before Triton is imported: its kernels then run on the CPU, step by step
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 
 # A shell that starts the tests in the background has them ignore Ctrl-C, which what they start inherits: the tests of
 # interrupted runs would wait for ever.

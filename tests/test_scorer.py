@@ -11,7 +11,7 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import axis_angle, pose, transform
 from dexgrasp.grasps import Grasps
 from dexgrasp.model import GraspNet, build_model, load_model, save_model
-from dexgrasp.scorer import COARSE, NEAREST, Scorer, around_reference, coarse_points, surroundings
+from dexgrasp.scorer import COARSE, NEAREST, Scorer, around_reference, coarse_points, platt, surroundings
 from dexgrasp.selection import Selection
 from dexgrasp.statistics import roc_area
 from dexgrasp.testing.samples import seen
@@ -127,3 +127,21 @@ def test_roc_area():
     assert roc_area(torch.tensor([0.1, 0.3, 0.2, 0.4]), truth) == 0.75
     assert roc_area(torch.ones(4), torch.ones(4, dtype=torch.bool)) is None
     assert not math.isnan(roc_area(torch.rand(100), torch.rand(100) > 0.5))
+
+
+def test_calibration_makes_probabilities_come_true_and_keeps_the_order(hand):
+    torch.manual_seed(0)
+    logits = 2 * torch.randn(4000)
+    came = torch.bernoulli((0.5 * logits - 1).sigmoid())
+    slope, shift = platt(logits, came)
+    assert slope == pytest.approx(0.5, abs=0.06) and shift == pytest.approx(-1, abs=0.1)
+    for all_alike in (torch.ones(50), torch.zeros(50)):
+        slope, shift = platt(logits[:50], all_alike)
+        assert slope > 0 and math.isfinite(shift)
+    scorer, grasps = Scorer(hand, 8).eval(), some(hand, 64)
+    given = torch.randn(64, 8), torch.randn(64, 6), grasps, torch.randn(64, NEAREST, 7)
+    before = scorer(*given).detach()
+    came = torch.bernoulli((before - before.mean()).sigmoid())
+    slope, shift = platt(before, came)
+    scorer.calibrate(before, came)
+    torch.testing.assert_close(scorer(*given), slope * before + shift, atol=1e-4, rtol=1e-4)

@@ -10,6 +10,7 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.model import GraspNet
 from dexgrasp.plugins import load_backbone, load_hand, load_representation
 from dexgrasp.representation import Targets
+from dexgrasp.training.feed import Feed
 from dexgrasp.training.loop import train
 from dexgrasp.training.settings import TrainerSettings, order, schedule
 from dexgrasp.training.state import FILE
@@ -94,6 +95,38 @@ def test_same_result_whatever_the_number_of_processes(samples, tmp_path):
     two, summary = run(samples, tmp_path / "two", processes=2)
     assert summary.processes == 2
     same(one, two)
+
+
+def test_views_kept_on_the_device_give_the_same_training(samples, tmp_path):
+    one, _ = run(samples, tmp_path / "read", processes=1)
+    two, _ = run(samples, tmp_path / "kept", processes=1, resident=True)
+    same(one, two)
+
+
+def test_views_are_read_ahead_for_another_device(samples, monkeypatch):
+    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda tensor: tensor)  # of which a CPU alone has none
+    read = []
+    monkeypatch.setattr(Samples, "rows", lambda self, rows, own=Samples.rows: (read.append(rows), own(self, rows))[1])
+    batches = Feed(samples, torch.device("meta")).batches([[0, 1], [4], [5, 2]])
+    assert next(batches).cloud.shape == (2, 64, 6) and [0, 1] in read and [5, 2] not in read
+    rest = list(batches)
+    assert [batch.cloud.device.type for batch in rest] == ["meta"] * 2 and [len(batch.cloud) for batch in rest] == [
+        1,
+        2,
+    ]
+    assert read == [[0, 1], [4], [5, 2]]
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize("resident", [True, False])
+def test_batches_on_cuda_are_those_of_the_cpu(samples, resident):
+    wanted = [[0, 1], [4], [5, 2]]
+    for indices, batch in zip(wanted, Feed(samples, torch.device("cuda"), resident).batches(wanted), strict=True):
+        expected = samples.batch(indices)
+        assert torch.equal(batch.cloud.cpu(), expected.cloud)
+        assert all(torch.equal(rows.cpu(), expected.plan[name]) for name, rows in batch.plan.items())
+        same(batch.targets.to("cpu").tensors(), expected.targets.tensors())
 
 
 def test_loss_falls_and_log_is_whole(samples, tmp_path):

@@ -118,7 +118,7 @@ def _model(given: dict[str, Any]) -> GraspNet:
                 "train one (`python -m dexgrasp train`) and give its folder: model=runs/train/...",
             )
         given["model"] = hand
-    model = load_model(given["model"])
+    model = load_model(given["model"], device=given["device"], precision=given["precision"], captured=given["captured"])
     if hand is not None and hand != model.hand.name:
         raise DexgraspError(
             f"a model of the hand {hand!r}", f"{given['model']} is of {model.hand.name!r}", "leave hand= out"

@@ -47,11 +47,13 @@ def estimate_normals(
     cells = make_cells(cloud, radius)
     if cells.occupied * SPARSE > len(cloud):
         cells = make_cells(cloud, WIDER * radius)
-    normals, lonely = _fit_near(cells, cloud, rows, k, min(FEWEST, k), radius, eye)
+    wanted = np.zeros(len(cloud), np.bool_)
+    wanted[rows] = True
+    normals, lonely = _fit_near(cells, wanted, k, min(FEWEST, k), radius, eye)
     if len(lonely):
-        neighbours = cKDTree(cloud).query(cloud[rows[lonely]], k=min(FEWEST, k))[1]
-        normals[lonely] = _fit_neighbours(cloud, rows[lonely], neighbours, eye)
-    return torch.from_numpy(normals).to(points)
+        neighbours = cKDTree(cloud).query(cloud[lonely], k=min(FEWEST, k))[1]
+        normals[lonely] = _fit_neighbours(cloud, lonely, neighbours, eye)
+    return torch.from_numpy(normals[rows]).to(points)
 
 
 def depth_normals(
@@ -72,52 +74,74 @@ def depth_normals(
 
 @numba.njit(cache=True)
 def _fit_near(
-    cells: Cells, cloud: NDArray, rows: NDArray, most: int, fewest: int, radius: float, eye: NDArray
+    cells: Cells, wanted: NDArray, most: int, fewest: int, radius: float, eye: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Fit the `most` nearest points within the radius, or the `fewest` nearest where there are fewer.
 
-    Return the normals, and for which of the rows even the surrounding cells hold too few.
+    Return the normals (N, 3) of the `wanted` points, and those of which even the surrounding cells hold too few.
     """
-    cells, cloud, rows = borrowed(cells), borrowed(cloud), borrowed(rows)
-    keys, starts, stops, low, side = cells.keys, cells.starts, cells.stops, cells.low, cells.side
+    cells, wanted = borrowed(cells), borrowed(wanted)
+    keys, order, low, side = cells.keys, cells.order, cells.low, cells.side
     px, py, pz = cells.points
-    normals, lonely, alone = np.zeros((len(rows), 3)), np.empty(len(rows), np.int64), 0
-    near, index = np.empty(len(px)), np.empty(len(px), np.int64)
-    sums = np.empty(9)
-    for m in range(len(rows)):
-        x, y, z = cloud[rows[m]]
+    normals, lonely, alone = np.zeros((len(px), 3)), np.empty(len(px), np.int64), 0
+    around, near, index = np.empty((3, len(px))), np.empty(len(px)), np.empty(len(px), np.int64)
+    qx, qy, qz = around
+    sums, least, count, known = np.empty(9), np.empty(fewest), 0, -1
+    for m in range(len(px)):
+        if not wanted[order[m]]:
+            continue
+        x, y, z = px[m], py[m], pz[m]
         i, j, k = int((x - low[0]) / side) + 1, int((y - low[1]) / side) + 1, int((z - low[2]) / side) + 1
-        count, inside = 0, 0
-        for a in range(i - 1, i + 2):
-            for b in range(j - 1, j + 2):
-                for c in range(k - 1, k + 2):
-                    key = (a << 2 * BITS) | (b << BITS) | c
-                    slot = find_cell(keys, key)
-                    if keys[slot] == key:
-                        start = starts[slot]
-                        for n in range(stops[slot] - start):
-                            u, v, w = px[start + n] - x, py[start + n] - y, pz[start + n] - z
-                            near[count + n], index[count + n] = u * u + v * v + w * w, start + n
-                        count += stops[slot] - start
-        limit = radius * radius
+        own = (i << 2 * BITS) | (j << BITS) | k
+        if own != known:  # points of one cell follow each other: they have the same around them
+            known, count = own, 0
+            for a in range(i - 1, i + 2):
+                for b in range(j - 1, j + 2):
+                    for c in range(k - 1, k + 2):
+                        key = (a << 2 * BITS) | (b << BITS) | c
+                        slot = find_cell(keys, key)
+                        if keys[slot] == key:
+                            for n in range(cells.starts[slot], cells.stops[slot]):
+                                qx[count], qy[count], qz[count] = px[n], py[n], pz[n]
+                                count += 1
+        limit, inside = radius * radius, 0
+        for n in range(count):
+            u, v, w = qx[n] - x, qy[n] - y, qz[n] - z
+            near[n] = u * u + v * v + w * w
         for n in range(count):
             inside += near[n] <= limit
         if inside > most:
             limit = min(limit, np.partition(near[:count], most - 1)[most - 1])
         elif inside < fewest:
-            limit = np.partition(near[:count], fewest - 1)[fewest - 1] if count >= fewest else np.inf
+            limit = _smallest(near, count, least) if count >= fewest else np.inf
             if limit > side * side:  # something nearer may lie in other cells
-                lonely[alone] = m
+                lonely[alone] = order[m]
                 alone += 1
                 continue
-        sums[:] = 0.0
         taken = 0
         for n in range(count):
-            if near[n] <= limit:
-                _add(sums, px[index[n]] - x, py[index[n]] - y, pz[index[n]] - z)
-                taken += 1
-        _plane(sums, taken, eye[0] - x, eye[1] - y, eye[2] - z, normals[m])
+            index[taken] = n
+            taken += near[n] <= limit
+        sums[:] = 0.0
+        for n in range(taken):
+            _add(sums, qx[index[n]] - x, qy[index[n]] - y, qz[index[n]] - z)
+        _plane(sums, taken, eye[0] - x, eye[1] - y, eye[2] - z, normals[order[m]])
     return normals, lonely[:alone]
+
+
+@numba.njit(cache=True)
+def _smallest(values: NDArray, count: int, least: NDArray) -> float:
+    """Return the largest of the smallest of the first `count` values, as many as `least` has room for."""
+    least[:] = np.inf
+    for n in range(count):
+        value, place = values[n], len(least) - 1
+        if value >= least[place]:
+            continue
+        while place > 0 and least[place - 1] > value:
+            least[place] = least[place - 1]
+            place -= 1
+        least[place] = value
+    return float(least[-1])
 
 
 @numba.njit(cache=True)

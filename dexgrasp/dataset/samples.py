@@ -4,7 +4,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,16 +57,24 @@ class Samples:
 
     def batch(self, indices: Sequence[int]) -> Batch:
         """Return the views `indices`, copied into memory."""
-        rows = {key: torch.from_numpy(array[list(indices)]) for key, array in self.arrays.items()}
-        plan = {key.removeprefix("plan."): value.long() for key, value in rows.items() if key.startswith("plan.")}
-        targets = {name: rows[f"target.{name}"].flatten(0, 1) for name in TARGETS}
-        targets["finger"] = targets["finger"].long()
-        return Batch(rows["cloud"], plan, Targets(**targets))
+        return assembled(self.rows(indices))
+
+    def rows(self, indices: Sequence[int]) -> dict[str, Tensor]:
+        """Return all arrays of the views `indices`, copied into memory, as they are kept: see `assembled`."""
+        return {key: torch.from_numpy(array[list(indices)]) for key, array in self.arrays.items()}
 
     @property
     def graspable(self) -> float:
         """Share of seed points that carry a label."""
         return float((self.arrays["target.finger"][:] > 0).mean())
+
+
+def assembled(rows: Mapping[str, Tensor]) -> Batch:
+    """Return the batch of some views' rows, where these lie."""
+    plan = {key.removeprefix("plan."): value.long() for key, value in rows.items() if key.startswith("plan.")}
+    targets = {name: rows[f"target.{name}"].flatten(0, 1) for name in TARGETS}
+    targets["finger"] = targets["finger"].long()
+    return Batch(rows["cloud"], plan, Targets(**targets))
 
 
 def collect(

@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +25,15 @@ from torch import Tensor, nn
 from dexgrasp.checkpoint import read_tensors
 from dexgrasp.child import end_with_parent
 from dexgrasp.dataset.samples import Batch, Samples
+from dexgrasp.device import find_device
 from dexgrasp.errors import DexgraspError
+from dexgrasp.heap import keep_freed_memory
 from dexgrasp.model import GraspNet
 from dexgrasp.progress import track
 from dexgrasp.seeds import stream
 from dexgrasp.training import state
 from dexgrasp.training.calibration import calibrate, validate
+from dexgrasp.training.feed import Feed
 from dexgrasp.training.log import Log
 from dexgrasp.training.settings import TrainerSettings, order, schedule
 
@@ -115,6 +119,7 @@ def _run(
     stop: Any,
 ) -> None:
     """One process of the training; rank 0 writes."""
+    keep_freed_memory()
     if world > 1:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent tells us
         model = copy.deepcopy(model)  # what was sent here lies in memory that all processes share
@@ -122,7 +127,9 @@ def _run(
         backend = "nccl" if device.type == "cuda" else "gloo"
         os.environ.update(MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port))
         torch.distributed.init_process_group(backend, rank=rank, world_size=world)
-        device = torch.device("cuda", rank) if device.type == "cuda" else device
+        if device.type == "cuda":
+            device = torch.device("cuda", rank)
+            torch.cuda.set_device(device)
     torch.manual_seed(int(stream(seed, "training").integers(2**31)))
     model.to(device).train()
     average = {key: value.detach().clone() for key, value in model.state_dict().items()}
@@ -133,6 +140,8 @@ def _run(
     log = Log(folder, step) if rank == 0 else None
     mine = range(rank, settings.shards, world)
     pending = range(step, settings.steps)
+    views = (order(len(samples), settings, seed, done)[shard] for done in pending for shard in mine)
+    batches = Feed(samples, device, settings.resident).batches(views)
     losses: dict[str, float] = {}
     for done in track(pending, "training") if rank == 0 else pending:
         step = done + 1
@@ -140,8 +149,7 @@ def _run(
             group["lr"] = settings.learning_rate * schedule(done, settings)
         optimizer.zero_grad(set_to_none=False)
         terms: dict[str, Tensor] = {}
-        for shard in mine:
-            batch = samples.batch(order(len(samples), settings, seed, done)[shard]).to(device)
+        for batch in islice(batches, len(mine)):
             for name, value in _backward(model, batch, settings).items():
                 terms[name] = terms.get(name, torch.zeros((), device=device)) + value / settings.shards
         halted = _reduce(model, terms, bool(stop.is_set()), world, device)
@@ -162,6 +170,7 @@ def _run(
                 state.save(folder / state.FILE, model, average, optimizer, step, losses)
         if halted:
             break
+    batches.close()
     if log is not None:
         log.close()
     if world > 1:
@@ -224,18 +233,17 @@ def _optimizer(model: GraspNet, settings: TrainerSettings) -> torch.optim.Optimi
 
 def device_of(settings: TrainerSettings) -> torch.device:
     """Return the device to train on; raises DexgraspError where there is none of that name."""
-    name, there = settings.device, torch.cuda.is_available()
-    if name == "auto":
-        return torch.device("cuda" if there else "cpu")
-    if name.partition(":")[0] not in ("cpu", "cuda"):
-        raise DexgraspError("trainer.device auto, cpu or cuda", repr(name), "choose one of them")
-    if name.startswith("cuda") and not there:
-        raise DexgraspError("a CUDA device for trainer.device", "torch sees none", "use trainer.device=cpu")
-    return torch.device(name)
+    return find_device(settings.device, "trainer.device")
 
 
 def _processes(settings: TrainerSettings, device: torch.device) -> int:
-    most = torch.cuda.device_count() if device.type == "cuda" else len(os.sched_getaffinity(0))
+    most = len(os.sched_getaffinity(0))
+    if device.type == "cuda":  # cuda:1 is that one
+        most = torch.cuda.device_count() if device.index is None else 1
+        if settings.processes is not None and settings.processes > most:
+            raise DexgraspError(
+                f"trainer.processes of at most {most}, one for each GPU", str(settings.processes), "null takes them all"
+            )
     wanted = settings.processes or min(most, settings.shards)
     return max(count for count in range(1, wanted + 1) if settings.shards % count == 0)
 

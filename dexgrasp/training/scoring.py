@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import joblib
 import torch
@@ -21,9 +22,13 @@ from dexgrasp.grasps import Grasps
 from dexgrasp.level import levelled
 from dexgrasp.model import GraspNet, load_model
 from dexgrasp.progress import track
+from dexgrasp.reliability import reliability
+from dexgrasp.scene import View
 from dexgrasp.scorer import COARSE, Scorer, coarse_points, surroundings
 from dexgrasp.seeds import stream, torch_stream
 from dexgrasp.selection import free
+from dexgrasp.simulation.mujoco import MujocoSimulator
+from dexgrasp.simulation.protocol import load_protocol
 from dexgrasp.statistics import roc_area
 
 DRAWN = 3
@@ -41,6 +46,9 @@ class ScorerSettings:
     hidden: tuple[int, ...] = (256, 128)
     around: tuple[int, ...] = (32, 64)
     per_view: int = 200
+    verdicts: int = 0
+    protocol: str = "lift-bulk-v1"
+    weight: float = 5.0
     views: int | None = None
     epochs: int = 4
     batch: int = 2048
@@ -54,6 +62,10 @@ class ScorerSettings:
         for name in ("choices", "most", "per_view", "epochs", "batch"):
             if getattr(self, name) < 1:
                 raise DexgraspError(f"scorer.{name} of at least 1", str(getattr(self, name)), f"set scorer.{name}")
+        if self.verdicts < 0 or self.weight <= 0:
+            found = f"{self.verdicts}, {self.weight}"
+            raise DexgraspError("scorer.verdicts of at least 0, scorer.weight above it", found, "set them so")
+        load_protocol(self.protocol).on_table("the scorer's verdicts")
         for name in ("clear", "blocked"):
             worth, wanted = getattr(self, name), len(self.capacity) + 2
             if len(worth) != wanted or not all(0 <= value <= 1 for value in worth):
@@ -78,6 +90,8 @@ class Proposals(Batch):
     """Probability of graspable as the heads tell it."""
     worth: Float[Tensor, "N"]
     """How likely the grasp is to lift, by how it closes on the true object."""
+    lifted: Float[Tensor, "N"]
+    """What the simulator says: 1 lifted, 0 not, NaN not tried."""
     holds: Bool[Tensor, "N"]
     """It is clear of everything and holds so many times its weight as labels do, its own at least."""
 
@@ -94,6 +108,8 @@ class ScorerSummary:
     """Area under the ROC on validation views."""
     area_before: float | None = None
     """The same of the heads' own score."""
+    verdicts: dict[str, Any] | None = None
+    """Reliability (`dexgrasp.reliability`) on what was executed of validation views, before it was calibrated there."""
 
 
 def fit_scorer(
@@ -113,13 +129,18 @@ def fit_scorer(
     )
     _fit(scorer, known, settings, seed)
     model.scorer = scorer
-    areas: tuple[float | None, ...] = (None, None)
+    area = before = verdicts = None
     if dataset.split("validation"):
         unseen = _propose(path, dataset, dataset.split("validation"), settings, seed, workers, "scorer, validation")
         with torch.no_grad():
             told = scorer(unseen.features, unseen.at, _grasps(unseen), unseen.around)
-        areas = roc_area(told, unseen.holds), roc_area(unseen.score, unseen.holds)
-    return ScorerSummary(len(known), float(known.holds.double().mean()), time.perf_counter() - began, *areas)
+        area, before = roc_area(told, unseen.holds), roc_area(unseen.score, unseen.holds)
+        tried = ~unseen.lifted.isnan()
+        if tried.any():
+            verdicts = reliability(told[tried].sigmoid(), unseen.lifted[tried] > 0)
+            scorer.calibrate(told[tried], unseen.lifted[tried])
+    holding, seconds = float(known.holds.double().mean()), time.perf_counter() - began
+    return ScorerSummary(len(known), holding, seconds, area, before, verdicts)
 
 
 def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) -> None:
@@ -136,7 +157,10 @@ def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) 
         for start in range(0, len(known) - size + 1, size):
             rows = known[shuffled[start : start + size]]
             logits = scorer(rows.features, rows.at, _grasps(rows), rows.around)
-            loss = F.binary_cross_entropy_with_logits(logits, rows.worth)
+            tried = ~rows.lifted.isnan()
+            wanted = torch.where(tried, rows.lifted, rows.worth)
+            weight = torch.where(tried, settings.weight, 1.0)
+            loss = F.binary_cross_entropy_with_logits(logits, wanted, weight)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -186,10 +210,24 @@ def _of_view(path: Path, stamp: int, dataset: Dataset, index: int, settings: Sco
         worth = torch.where(found.clear, torch.tensor(settings.clear)[kind], torch.tensor(settings.blocked)[kind])
         holds = found.clear & (found.capacity >= max(truth.settings.capacity, 1.0))
         around = surroundings(hand, grasps, coarse[:COARSE]).half()
-        scores = grasps.quality
-        return Proposals(features[at], cloud[seeds[at]], grasps.pose, grasps.joints, around, scores, worth, holds)
+        lifted = torch.full_like(worth, torch.nan)
+        lifted[: settings.verdicts] = _executed(dataset, view, grasps[: settings.verdicts], index, settings.protocol)
+        told_by = features[at], cloud[seeds[at]], grasps.pose, grasps.joints, around, grasps.quality
+        return Proposals(*told_by, worth, lifted, holds)
     finally:
         torch.set_num_threads(threads)
+
+
+def _executed(dataset: Dataset, view: View, grasps: Grasps, index: int, protocol: str) -> Float[Tensor, "N"]:
+    """Return 1 for each grasp (level frame) that the simulator lifts on the untouched scene, else 0."""
+    if not len(grasps):
+        return torch.zeros(0)
+    scene = dataset.scene(dataset.scene_of(index))
+    objects = [dataset.objects[name] for name in scene.objects]
+    simulator = MujocoSimulator(dataset.config["simulator"]["settling"])
+    placed, rules = grasps.to(torch.float64).moved(view.world_T_camera.double()), load_protocol(protocol)
+    outcome = simulator.execute(objects, scene.poses.double(), dataset.hand, placed, rules, fixtures=scene.fixtures)
+    return outcome.success.float()
 
 
 @lru_cache(1)

@@ -17,6 +17,7 @@ class TrainerSettings:
     processes: int | None = None
     device: str = "auto"
     precision: str = "float32"
+    resident: bool | None = None
     optimizer: str = "adam"
     learning_rate: float = 0.004
     weight_decay: float = 0.0

@@ -22,6 +22,8 @@ class PointNet(Backbone):
         head: layer sizes on [own feature, maximum] at the seeds.
     """
 
+    farthest_first = True
+
     def __init__(
         self,
         points: int = 2048,
@@ -47,7 +49,7 @@ class PointNet(Backbone):
         self, cloud: Float[Tensor, "B N 6"], plan: Plan | None = None
     ) -> tuple[Float[Tensor, "B M C"], Int[Tensor, "B M"]]:
         if plan is None:
-            plan = {"seeds": torch.stack([self.plan(points)["seeds"] for points in cloud[..., :3]]).to(cloud.device)}
+            plan = self.plans(cloud[..., :3])
         seeds = plan["seeds"]
         local = self.local(cloud.flatten(0, 1))
         whole = self.summary(local).unflatten(0, cloud.shape[:2]).amax(dim=1)

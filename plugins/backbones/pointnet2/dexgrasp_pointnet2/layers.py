@@ -47,7 +47,7 @@ class SetAbstraction(nn.Module):
     ) -> Float[Tensor, "M D"]:
         # Positions of a scene differ by millimetres around a metre: half precision would lose them.
         with torch.autocast(points.device.type, enabled=False):
-            rows = self.feature(features.to(points)) + self.position(points)
+            rows = torch.addmm(self.feature(features.to(points)), points, self.position.weight.T)
             origin = self.position(centres)
             rows = ball_max(rows, group) if self.factorised else F.embedding(group, rows)
             rows = (rows - origin.reshape(len(group), *[1] * (rows.dim() - 2), -1)).flatten(0, -2)

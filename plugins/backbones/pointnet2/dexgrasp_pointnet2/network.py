@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from dexgrasp import kernels
 from dexgrasp.backbone import Backbone, Plan
 from dexgrasp.errors import DexgraspError
 from dexgrasp.sampling import farthest_points, neighbours
@@ -33,6 +34,8 @@ class PointNet2(Backbone):
         u_shape: propagate level by level with skip connections; otherwise the coarsest features are interpolated
             straight onto the seeds (the paper's ablation).
     """
+
+    farthest_first = True
 
     def __init__(
         self,
@@ -88,12 +91,27 @@ class PointNet2(Backbone):
             plan[f"up_{i}"] = neighbours(coarse, levels[i + 1], 3).to(small)
         return {"seeds": plan["sample_0"].long(), **plan}
 
+    def plans(self, points: Float[Tensor, "B N 3"]) -> Plan:
+        """Return the stacked plans of a batch of clouds, on their device; int64 where kernels find them, on CUDA."""
+        if not kernels.usable(points):
+            return super().plans(points)
+        plan: Plan = {}
+        levels, arranged = [points.detach()], [kernels.arrange(points)]
+        for i, (count, radius, size) in enumerate(zip(self.points, self.radii, self.neighbours, strict=True)):
+            sample = plan[f"sample_{i}"] = arranged[i].farthest(min(count, levels[i].shape[1]))
+            levels.append(levels[i].take_along_dim(sample.unsqueeze(-1), dim=1))
+            plan[f"group_{i}"] = arranged[i].nearest(levels[i + 1], size, radius)
+            arranged.append(kernels.arrange(levels[i + 1]))
+        for i in range(len(self.decoder)):
+            coarse = arranged[i + 2] if self.u_shape else arranged[-1]
+            plan[f"up_{i}"] = coarse.nearest(levels[i + 1], 3)
+        return {"seeds": plan["sample_0"], **plan}
+
     def forward(
         self, cloud: Float[Tensor, "B N 6"], plan: Plan | None = None
     ) -> tuple[Float[Tensor, "B M C"], Int[Tensor, "B M"]]:
         if plan is None:
-            plans = [self.plan(points) for points in cloud[..., :3]]
-            plan = {name: torch.stack([p[name] for p in plans]).to(cloud.device) for name in plans[0]}
+            plan = self.plans(cloud[..., :3])
         batch = len(cloud)
 
         levels = [cloud[..., :3].flatten(0, 1)]
