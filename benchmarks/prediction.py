@@ -31,10 +31,9 @@ from dexgrasp import config, heads, sampling, scorer
 from dexgrasp.cloud import prepare
 from dexgrasp.dataset import normals
 from dexgrasp.geometry import inverse
-from dexgrasp.grasps import Grasps
 from dexgrasp.level import carried, level_frame
 from dexgrasp.model import GraspNet, build_model
-from dexgrasp.scorer import Scorer, coarse_points, surroundings
+from dexgrasp.scorer import COARSE, Scorer, surroundings
 from dexgrasp.selection import select
 from dexgrasp.table import find_table
 from dexgrasp.testing.views import seen_scenes
@@ -78,14 +77,17 @@ def stages(model: GraspNet, points: np.ndarray) -> dict[str, float]:
     lap("backbone")
     judge = model.scorer
     with patch.object(model, "_features", lambda *_: features):
-        rows, seeds, told = model.told(level, plan, judge.choices if judge else 1, judge.most if judge else None)
+        rows, chosen, told, seeds = model._told(
+            level, plan, judge.choices if judge else 1, judge.most if judge else None
+        )
     lap("heads, decoding")
     if judge is not None:
-        spread = coarse_points(level)
-        scores = [judge(rows, level[seeds], each, surroundings(model.hand, each, spread)) for each in told]
-        told = [each.replace(quality=score.sigmoid()) for each, score in zip(told, scores, strict=True)]
+        answers = len(told) // len(rows)
+        near = surroundings(model.hand, told, level[seeds[:COARSE]])
+        score = judge(rows.repeat(answers, 1), level[chosen].repeat(answers, 1), told, near)
+        told = told.replace(quality=score.sigmoid())
         lap("scorer")
-    grasps = Grasps.cat(told).moved(inverse(level_T_camera))
+    grasps = told.moved(inverse(level_T_camera))
     select(model.hand, grasps, cloud, 20, model.selection, table)
     lap("selection")
     return spent

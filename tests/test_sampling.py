@@ -66,3 +66,12 @@ def test_neighbours_of_few_points():
     expected = torch.tensor([[0, 1, 0], [1, 0, 1]])
     assert torch.equal(neighbours(xyz, xyz, 3), expected)
     assert torch.equal(neighbours_reference(xyz, xyz, 3), expected)
+
+
+@pytest.mark.parametrize("name", ["pointnet", "pointnet2"])
+def test_seeds_that_are_said_to_be_farthest_points_are(name):
+    from dexgrasp.plugins import build_backbone
+
+    xyz, backbone = cloud(3000), build_backbone({"name": name})
+    assert backbone.farthest_first
+    assert torch.equal(backbone.plan(xyz)["seeds"][:512], farthest_points(xyz, 512))

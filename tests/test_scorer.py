@@ -89,6 +89,12 @@ def test_a_network_with_a_scorer_chooses_from_several_answers(tmp_path):
     assert (grasps.quality.diff() <= 0).all() and not torch.equal(grasps.pose[:5], plain.pose[:5])
     proposed = model.propose(cloud())
     assert len(proposed) == 300, "three answers at each of the hundred points that are most graspable"
+    features, seeds, told = model.told(cloud(), choices=3, most=100)
+    points_at, normals_at = cloud()[seeds].split(3, dim=1)
+    with torch.no_grad():
+        for choice, each in enumerate(told):  # all answers at once say what each says alone
+            alone = model.representation.decode(points_at, normals_at, model.representation(features, choice=choice))
+            torch.testing.assert_close(each.pose, alone.pose)
     first, second = proposed.pose[:100], proposed.pose[100:200]
     assert not torch.isclose(first, second).flatten(1).all(dim=1).any()
     save_model(tmp_path / "model.safetensors", model)
