@@ -11,7 +11,7 @@ import joblib
 import numpy as np
 import trimesh
 
-from dexgrasp.child import end_with_parent
+from dexgrasp.child import start_worker
 from dexgrasp.convex import convex_parts
 from dexgrasp.errors import DexgraspError
 from dexgrasp.objects import Object
@@ -69,7 +69,7 @@ def load_folder(
     entries = find_entries(path, layout, scale, include, exclude, count)
     jobs = (joblib.delayed(_load)(entry, repair, threshold) for entry in entries)
     results: list[tuple[str, Object | None, str]] = list(
-        joblib.Parallel(n_jobs=workers, initializer=end_with_parent)(jobs)
+        joblib.Parallel(n_jobs=workers, initializer=start_worker)(jobs)
     )
     known = origins(root)
     objects = []

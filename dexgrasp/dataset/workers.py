@@ -5,9 +5,8 @@ from contextlib import contextmanager
 from typing import Any
 
 import joblib
-from joblib.externals.loky import process_executor
 
-from dexgrasp.child import end_with_parent
+from dexgrasp.child import start_worker
 from dexgrasp.errors import DexgraspError
 
 BACKENDS = ("loky", "threading", "ray", "dask")
@@ -52,7 +51,7 @@ def pool(backend: str, workers: int | None = None, address: str | None = None) -
         ):
             yield parallel
     elif backend == "loky":
-        yield joblib.Parallel(n_jobs=here, backend=backend, initializer=_begin, **options)
+        yield joblib.Parallel(n_jobs=here, backend=backend, initializer=start_worker, **options)
     else:
         yield joblib.Parallel(n_jobs=here, backend=backend, **options)
 
@@ -118,11 +117,3 @@ def _reached(kind: str, address: str | None, connect: Any) -> Any:
 def _absent(backend: str) -> DexgraspError:
     remedy = f"pip install 'dexgrasp[{backend}]', or set dataset.backend=loky"
     return DexgraspError(f"the package {backend} for dataset.backend={backend}", "not installed", remedy)
-
-
-def _begin() -> None:
-    """Begin a worker's life."""
-    end_with_parent()
-    # Where psutil is installed, loky replaces workers that have grown by 300 MB, and what they keep is lost: distance
-    # fields and grasps, which are bounded by themselves.
-    process_executor._MAX_MEMORY_LEAK_SIZE = 8 * 2**30

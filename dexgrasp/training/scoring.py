@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from dexgrasp.batch import Batch
-from dexgrasp.child import end_with_parent
+from dexgrasp.child import start_worker
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.stages import scene_truth
 from dexgrasp.errors import DexgraspError
@@ -176,7 +176,7 @@ def _grasps(known: Proposals) -> Grasps:
 def _propose(
     path: Path, dataset: Dataset, views: Sequence[int], settings: ScorerSettings, seed: int, workers: int, label: str
 ) -> Proposals:
-    parallel = joblib.Parallel(n_jobs=workers, return_as="generator", initializer=end_with_parent)
+    parallel = joblib.Parallel(n_jobs=workers, return_as="generator", initializer=start_worker)
     stamp = path.stat().st_mtime_ns
     jobs = (joblib.delayed(_of_view)(path, stamp, dataset, view, settings, seed) for view in views)
     return Proposals.cat(list(track(parallel(jobs), label, total=len(views))))
