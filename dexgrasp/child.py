@@ -15,7 +15,7 @@ def end_with_parent() -> None:
 def start_worker() -> None:
     """Prepare a worker process of joblib; its `initializer`.
 
-    Where psutil is installed, loky takes a worker that has grown by 300 MB for one that leaks, and starts another, which
+    Where psutil is installed, loky takes a worker that has grown by 300 MB for one that leaks and starts another, which
     has to load and to make everything anew. Ours keep distance fields and grasps up to a bound of their own.
     """
     end_with_parent()
