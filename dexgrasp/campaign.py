@@ -131,7 +131,14 @@ class Campaign:
             grasps = predict_sight(network, seen, self.top_k, self.selection, seed=self.seed).grasps
         else:
             grasps = network.predict(view.points, view.normals, self.top_k, self.selection, self.seed)
-        return grasps if network.scorer is None else grasps[grasps.quality >= self.policy.min_lift]
+        return grasps
+
+    @property
+    def least(self) -> float:
+        """Return what a grasp must be worth to be tried: a network's scorer tells probabilities, nobody else does."""
+        if self.model is None or _network(self.model, self.model.stat().st_mtime_ns).scorer is None:
+            return 0.0
+        return self.policy.min_lift
 
     def _planner(self) -> Planner:
         assert self.planner is not None
@@ -184,6 +191,7 @@ def _work(
             campaign.reached,
             draw=index < campaign.drawn,
             fixtures=fixtures,
+            least=campaign.least,
         )
         return episode, verdicts, told
     finally:

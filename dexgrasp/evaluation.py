@@ -74,7 +74,7 @@ class Policy:
     """rad"""
     doubt: float = 0.6
     """What a grasp is worth after each failure near it, as a share: what has failed once is likely to fail again."""
-    near: float = 0.06
+    near: float = 0.08
     """m between contacts"""
 
 
@@ -92,8 +92,11 @@ def clear(
     epsilon: Epsilon | None = None,
     draw: bool = False,
     fixtures: Boxes | None = None,
+    least: float = 0.0,
 ) -> Episode:
     """Clear one scene, at most ``policy.attempts_per_object`` attempts per object.
+
+    What is worth less than `least`, after doubts, is not tried.
 
     Objects that leave the table count as present and are never removed. Poses are world_T_object; the pose of an
     object that is gone is NaN. After a failure the scene settles before the camera looks again.
@@ -112,7 +115,7 @@ def clear(
         looked = time.perf_counter()
         situation = Situation(view, there, poses[standing].double(), fixtures, drawn)
         offered = predict(situation).moved(view.world_T_camera)
-        chosen = choose(offered[~tilted(hand, offered, protocol.verdict.max_tilt)], failed, policy)
+        chosen = choose(offered[~tilted(hand, offered, protocol.verdict.max_tilt)], failed, policy, least)
         predicted = time.perf_counter()
         seconds = {"render": looked - began, "predict": predicted - looked}
         if chosen is None:
@@ -154,8 +157,11 @@ def present(poses: Float[Tensor, "O 4 4"]) -> list[int]:
     return [int(i) for i in poses.flatten(1).isfinite().all(dim=1).nonzero().flatten()]
 
 
-def choose(offered: Grasps, failed: Sequence[Grasps], policy: Policy) -> Grasps | None:
-    """Return the offered grasp (world frame) worth most that does not repeat a failed one, None where there is none."""
+def choose(offered: Grasps, failed: Sequence[Grasps], policy: Policy, least: float = 0.0) -> Grasps | None:
+    """Return the offered grasp (world frame) worth most that does not repeat a failed one, None where there is none.
+
+    What is near failures is worth less (`Policy.doubt`), and nothing worth less than `least` is chosen.
+    """
     fresh, worth, places = torch.ones(len(offered), dtype=torch.bool), offered.quality.clone(), _place(offered)
     for grasp in failed:
         near = torch.linalg.vector_norm(offered.pose[:, :3, 3] - grasp.pose[:, :3, 3], dim=1) < policy.distance
@@ -164,7 +170,7 @@ def choose(offered: Grasps, failed: Sequence[Grasps], policy: Policy) -> Grasps 
         doubtful = torch.linalg.vector_norm(places - _place(grasp), dim=1) < policy.near
         worth[doubtful] *= policy.doubt
     order = torch.argsort(worth, descending=True, stable=True)
-    order = order[fresh[order]]
+    order = order[(fresh & (worth >= least))[order]]
     return offered[int(order[0])] if len(order) else None
 
 

@@ -140,6 +140,8 @@ def test_choose():
     assert choose(near, [], policy).pose[0, 0, 3] == pytest.approx(0.04)
     assert choose(near, [offered[0]], policy).pose[0, 0, 3] == pytest.approx(0.2), "what is near a failure is doubted"
     assert choose(near, [offered[0]], Policy(doubt=1.0)).pose[0, 0, 3] == pytest.approx(0.04)
+    assert choose(near[:1], [offered[0]], policy, least=0.5) is not None
+    assert choose(near[:1], [offered[0], offered[0]], policy, least=0.5) is None, "0.9 * 0.6 * 0.6 is too little"
 
 
 def test_absent_objects_are_not_present():
