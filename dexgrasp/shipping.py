@@ -139,7 +139,9 @@ def _card(
     yield from ("", "## Figures", "")
     yield from _figures(own, results)
     if config is not None:
-        yield from ("", "## Config", "", "```yaml", OmegaConf.to_yaml(config).rstrip(), "```")
+        # Where a folder lay on the machine of the training is nobody's business.
+        told = re.sub(r"(?m)(: )/\S*/([^/\s]+)$", r"\1.../\2", OmegaConf.to_yaml(config).rstrip())
+        yield from ("", "## Config", "", "```yaml", told, "```")
 
 
 def _data(config: DictConfig) -> Iterator[str]:
