@@ -213,7 +213,7 @@ def test_command_on_a_dataset(tiny, tmp_path, monkeypatch, capsys):
     arguments = ["eval", f"grasps={path}", "protocol=[lift-bulk-v1,dexgraspbench]", "per_object=3", "workers=1"]
     assert cli.main(arguments) == 0
     out = capsys.readouterr().out
-    assert "lift-bulk-v1 (version 3)" in out and "dexgraspbench (version 1)" in out
+    assert "lift-bulk-v1 (version 4)" in out and "dexgraspbench (version 1)" in out
     results = json.loads(next(tmp_path.rglob("results.json")).read_text())
     assert results["schema"] == "dexgrasp.scores/1" and results["grasps"] == 6
     assert [row["success_rate"]["trials"] for row in results["protocols"]][1] == 6

@@ -142,7 +142,7 @@ def test_scenes_are_made_of_what_lifts(made: Dataset, capsys: pytest.CaptureFixt
     assert carried > 0
     assert tool(["inspect", str(made.folders["verdicts"])]) == 0
     printed = capsys.readouterr().out
-    assert "lifted by lift-bulk-v1 (version 3)" in printed
+    assert f"lifted by {protocol}" in printed
 
 
 def test_only_what_follows_from_verdicts_depends_on_them(tmp_path: Path, composed: Composed) -> None:
