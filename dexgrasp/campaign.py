@@ -121,9 +121,9 @@ class Campaign:
 
     def predict(self, situation: Situation) -> Grasps:
         """Return the grasps that network or planner offer and that are worth trying, camera frame."""
-        if self.model is None:
+        network, view = self.network(), situation.view
+        if network is None:
             return self._planner().plan(situation, self.top_k)
-        view, network = situation.view, _network(self.model, self.model.stat().st_mtime_ns)
         if self.segmented:
             seen = sight(view, self.seed)
             if seen.objects == 0:
@@ -136,9 +136,12 @@ class Campaign:
     @property
     def least(self) -> float:
         """Return what a grasp must be worth to be tried: a network's scorer tells probabilities, nobody else does."""
-        if self.model is None or _network(self.model, self.model.stat().st_mtime_ns).scorer is None:
-            return 0.0
-        return self.policy.min_lift
+        network = self.network()
+        return 0.0 if network is None or network.scorer is None else self.policy.min_lift
+
+    def network(self) -> GraspNet | None:
+        """Return the network, loaded once in each process; None where a planner grasps."""
+        return None if self.model is None else _network(self.model, self.model.stat().st_mtime_ns)
 
     def _planner(self) -> Planner:
         assert self.planner is not None
@@ -172,9 +175,9 @@ def _work(
             labels, rules = dataset.scene_grasps(index), (dataset.hand, simulator, campaign.protocol, campaign.seed)
             verdicts = ceilings(index, objects, poses, labels, *rules, fixtures, campaign.oracle)
         told: list[tuple[float, bool]] = []
-        if campaign.reliability and campaign.model is not None:
+        network = campaign.network()
+        if campaign.reliability and network is not None:
             seed = int(stream(campaign.seed, "reliability", index).integers(2**31))
-            network = _network(campaign.model, campaign.model.stat().st_mtime_ns)
             what = network, campaign.look(index, objects, poses, seed), campaign.selection, campaign.reliability
             told = trials(*what, objects, poses, simulator, campaign.protocol, seed, fixtures)
         episode = clear(

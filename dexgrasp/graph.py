@@ -20,7 +20,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from dexgrasp.grasps import Grasps
-from dexgrasp.heads import Layers, _folded
+from dexgrasp.heads import Layers, folded
 
 if TYPE_CHECKING:
     from dexgrasp.model import GraspNet
@@ -114,7 +114,7 @@ def joined(model: "GraspNet") -> "GraspNet":
     for layers in [module for module in model.modules() if isinstance(module, Layers)]:
         for place, (layer, norm) in enumerate(pairwise(layers)):
             if isinstance(layer, nn.Linear) and isinstance(norm, nn.BatchNorm1d):
-                weight, bias = _folded(layer, norm)
+                weight, bias = folded(layer, norm)
                 whole = nn.Linear(layer.in_features, layer.out_features, device=weight.device)
                 whole.load_state_dict({"weight": weight, "bias": bias})
                 layers[place], layers[place + 1] = whole, nn.Identity()

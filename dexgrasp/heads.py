@@ -28,7 +28,7 @@ class Layers(nn.Sequential):
         steps: list[nn.Module | tuple[Tensor, Tensor]] = []
         for layer, following in zip(self, [*list(self)[1:], None], strict=False):
             if isinstance(layer, nn.Linear):
-                joined = _folded(layer, following) if isinstance(following, nn.BatchNorm1d) else None
+                joined = folded(layer, following) if isinstance(following, nn.BatchNorm1d) else None
                 steps.append(joined or (layer.weight, layer.bias))
             elif not isinstance(layer, nn.BatchNorm1d):
                 steps.append(layer)
@@ -41,7 +41,7 @@ class Layers(nn.Sequential):
             yield rows
 
 
-def _folded(layer: nn.Linear, norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
+def folded(layer: nn.Linear, norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
     """Return weight and bias of a linear layer and the batch norm behind it, with its running statistics."""
     assert norm.running_mean is not None and norm.running_var is not None
     scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from numba import njit
 from torch import Tensor
 
+from dexgrasp import wrench_model
 from dexgrasp.contact_wrenches import compiled_wrenches, cone_edges
 from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import inverse, transform
@@ -30,16 +31,8 @@ PIVOTS = 400
 ZERO = 1e-9
 
 
-class Body(Protocol):
+class Body(wrench_model.Body, Protocol):
     """What must be known of an object."""
-
-    @property
-    def com(self) -> np.ndarray:
-        """Centre of mass, m, object frame."""
-
-    @property
-    def radius(self) -> float:
-        """Largest distance from it to the surface, m."""
 
     @property
     def volume(self) -> float:

@@ -17,6 +17,7 @@ from dexgrasp.batch import Batch
 from dexgrasp.child import start_worker
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.stages import scene_truth
+from dexgrasp.dataset.verdicts import verify_scene
 from dexgrasp.errors import DexgraspError
 from dexgrasp.grasps import Grasps
 from dexgrasp.level import levelled
@@ -27,7 +28,6 @@ from dexgrasp.scene import View
 from dexgrasp.scorer import COARSE, Scorer, coarse_points, surroundings
 from dexgrasp.seeds import stream, torch_stream
 from dexgrasp.selection import free
-from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import load_protocol
 from dexgrasp.statistics import roc_area
 
@@ -224,10 +224,11 @@ def _executed(dataset: Dataset, view: View, grasps: Grasps, index: int, protocol
         return torch.zeros(0)
     scene = dataset.scene(dataset.scene_of(index))
     objects = [dataset.objects[name] for name in scene.objects]
-    simulator = MujocoSimulator(dataset.config["simulator"]["settling"])
-    placed, rules = grasps.to(torch.float64).moved(view.world_T_camera.double()), load_protocol(protocol)
-    outcome = simulator.execute(objects, scene.poses.double(), dataset.hand, placed, rules, fixtures=scene.fixtures)
-    return outcome.success.float()
+    # Whatever it lifts counts, as in an evaluation, not only the object at which it was told.
+    placed = grasps.to(torch.float64).moved(view.world_T_camera.double())
+    placed = placed.replace(object=torch.full_like(placed.object, -1))
+    tried = verify_scene(dataset.hand, objects, scene.poses.double(), placed, load_protocol(protocol), scene.fixtures)
+    return tried.success.float()
 
 
 @lru_cache(1)
