@@ -19,11 +19,13 @@ from dexgrasp.dataset.camera import MeshScene, Viewpoints
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.framing import Framing
 from dexgrasp.dataset.sensor import Sensor, capture
+from dexgrasp.dataset.stages import scene_truth
 from dexgrasp.evaluation import Episode, Policy, attempt_rows, clear, episode_rows, rate, summarise
 from dexgrasp.execution import opened
 from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
+from dexgrasp.load_capacity import lifts
 from dexgrasp.model import GraspNet, load_model
 from dexgrasp.objects import Object
 from dexgrasp.planner import Planner, Situation
@@ -40,6 +42,7 @@ from dexgrasp.sight import Sight
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.statistics import rate_interval
+from dexgrasp.support import support
 from dexgrasp.table import find_tabletop
 from dexgrasp.wrench_model import WrenchModel
 
@@ -173,7 +176,9 @@ def _work(
         verdicts: dict[str, list[bool]] = {}
         if label_ceilings:
             labels, rules = dataset.scene_grasps(index), (dataset.hand, simulator, campaign.protocol, campaign.seed)
-            verdicts = ceilings(index, objects, poses, labels, *rules, fixtures, campaign.oracle)
+            truth = scene_truth(dataset, index, torch.eye(4, dtype=torch.float64))
+            worth = support(labels, lifts(truth.capacity(labels)))
+            verdicts = ceilings(index, objects, poses, labels, *rules, fixtures, campaign.oracle, worth)
         told: list[tuple[float, bool]] = []
         network = campaign.network()
         if campaign.reliability and network is not None:

@@ -31,19 +31,24 @@ def ceilings(
     seed: int,
     fixtures: Boxes | None = None,
     oracle: int = 0,
+    worth: Float[Tensor, "N"] | None = None,
 ) -> dict[str, list[bool]]:
     """Execute, for each object of the untouched scene, its best label by epsilon and a random one.
 
-    `labels` are the feasible grasps of the scene (world frame); an object without any is not counted. With `oracle`,
-    also whether any of so many labels of an object holds, the best by epsilon first and others at random; there an
-    object without a label counts as a failure.
+    `labels` are the feasible grasps of the scene (world frame); an object without any is not counted. With `worth` of
+    each label, also the one of most worth. With `oracle`, also whether any of so many labels of an object holds, the
+    best (by `worth`, else by epsilon) first and others at random; there an object without a label counts as a failure.
     """
-    chosen: dict[str, list[Grasps]] = {"best_epsilon": [], "random": []}
+    kinds = ["best_epsilon", "random"] if worth is None else ["best", "best_epsilon", "random"]
+    chosen: dict[str, list[Grasps]] = {kind: [] for kind in kinds}
+    worth = labels.quality if worth is None else worth
     steep = tilted(hand, labels, protocol.verdict.max_tilt)
     for row in range(len(objects)):
         own = ((labels.object == row) & ~steep).nonzero().flatten()
         if len(own) == 0:
             continue
+        if "best" in chosen:
+            chosen["best"].append(labels[int(own[worth[own].argmax()])])
         chosen["best_epsilon"].append(labels[int(own[labels.quality[own].argmax()])])
         chosen["random"].append(labels[int(own[int(stream(seed, "ceiling", index, row).integers(len(own)))])])
     verdicts: dict[str, list[bool]] = {}
@@ -56,7 +61,7 @@ def ceilings(
         verdicts["oracle"] = []
         for row in range(len(objects)):
             rows = ((labels.object == row) & ~steep).nonzero().flatten().numpy()
-            rows = rows[np.argsort(-labels.quality[rows].numpy(), kind="stable")]
+            rows = rows[np.argsort(-worth[rows].numpy(), kind="stable")]
             rest = stream(seed, "oracle", index, row).permutation(rows[1:])
             tried = labels[torch.from_numpy(np.r_[rows[:1], rest][:oracle])]
             verdicts["oracle"].append(

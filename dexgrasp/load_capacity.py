@@ -29,6 +29,8 @@ LEAST_LEVER = 1e-3
 PIVOTS = 400
 """More than any grasp of ten fingers needed; what is reached by then holds, as every corner of the program does."""
 ZERO = 1e-9
+ENOUGH = 1.5
+"""Capacity beyond which more is soon worth little, see `lifts`."""
 
 
 class Body(wrench_model.Body, Protocol):
@@ -87,6 +89,14 @@ class Load:
         wrenches = compiled_wrenches(*told, self.friction, self.torsion, cone_edges(self.edges, self.torsion > 0))
         held = np.concatenate([up.double().numpy(), np.zeros(3)])
         return torch.from_numpy(capacities(wrenches, limits.double().nan_to_num(0.0).numpy(), held))
+
+
+def lifts(capacity: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+    """Return about how likely a network's grasp lifts that holds so many times the weight: 1 - exp(-capacity / 1.5).
+
+    `lift-v1` lifted 26, 41, 78, 86, 91, 95 % of 1,200 in clutter that held below 0.5, 1, 2, 3, 5 times, and more.
+    """
+    return 1 - torch.exp(-capacity / ENOUGH)
 
 
 def normal_forces(

@@ -10,13 +10,13 @@ LIKE_DISTANCE, LIKE_ANGLE = 0.02, 0.3
 """Scale on which two grasps are alike: bases apart, m; rotations and joints apart, rad."""
 
 
-def support(grasps: Grasps) -> Float[Tensor, "N"]:
-    """Return the quality of each grasp, summed over the grasps of its object that are like it (Gaussian weights).
+def support(grasps: Grasps, worth: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+    """Return the `worth` of each grasp, summed over the grasps of its object that are like it (Gaussian weights).
 
     Where many grasps are alike, a small error still gives a grasp; and neighbouring points are labelled with grasps of
     one kind, not with whichever is best by a hair, so that the labels can be learnt.
     """
-    worth = torch.zeros_like(grasps.quality)
+    result = torch.zeros_like(worth)
     for number in grasps.object.unique().tolist():
         row = (grasps.object == number).nonzero().flatten()
         own = grasps[row]
@@ -31,5 +31,5 @@ def support(grasps: Grasps) -> Float[Tensor, "N"]:
             dim=1,
         )
         weight = torch.exp(-0.5 * torch.cdist(like, like, compute_mode="donot_use_mm_for_euclid_dist").square())
-        worth[row] = (weight @ own.quality.double()).to(worth)
-    return worth
+        result[row] = (weight @ worth[row].double()).to(result)
+    return result

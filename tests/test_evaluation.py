@@ -181,6 +181,11 @@ def test_ceilings_take_best_and_random_of_each_object():
     verdicts = ceilings(0, things(3), poses(3), labels, HAND, Spy(), PROTOCOL, 0)
     assert verdicts == {"best_epsilon": [True, True], "random": [True, True]}
     assert torch.equal(seen[0].quality, labels.quality[[0, 3]])
+    worth = torch.tensor([0.0, 0.2, 0.1, 0.3, 0.5, 0.4])
+    seen.clear()
+    verdicts = ceilings(0, things(3), poses(3), labels, HAND, Spy(), PROTOCOL, 0, worth=worth)
+    assert list(verdicts) == ["best", "best_epsilon", "random"]
+    assert torch.equal(seen[0].quality, labels.quality[[1, 4]])
 
 
 def test_the_oracle_tries_labels_until_one_holds_and_counts_objects_without():

@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 from dexgrasp.contact_frame import contact_frame, place
 from dexgrasp.dataset.labels import LabelSettings, label, near_pairs
 from dexgrasp.dataset.truth import Truth, TruthSettings, deviation
+from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import axis_angle, pose
 from dexgrasp.grasps import Grasps
 from dexgrasp.sampling import farthest_points
@@ -122,6 +123,21 @@ def test_the_best_true_pair_labels_the_point(contact, toy_hand):
     assert (labels.point == torch.arange(len(view))).all()
     few = label(view, grasps, contact, near(), LabelSettings(tries=2, points=None))
     assert few.true.sum() < labels.true.sum()
+
+
+def test_worth_says_which_grasp_labels_a_point(contact, toy_hand):
+    view, grasps = ball_view(noise=0.02), ball_grasps(toy_hand, 400)
+    settings = LabelSettings(tries=1000, points=None, support=False)
+    by_quality = label(view, grasps, contact, near(), settings)
+    same = label(view, grasps, contact, near(), settings, worth=3 * grasps.quality)
+    other = label(view, grasps, contact, near(), settings, worth=1 - grasps.quality)
+    assert torch.equal(same.grasp, by_quality.grasp)
+    told = by_quality.true
+    assert torch.equal(other.true, told)
+    assert (other.quality[told] <= by_quality.quality[told]).all()
+    assert other.quality[told].mean() < by_quality.quality[told].mean()
+    with pytest.raises(DexgraspError, match="capacity or epsilon"):
+        LabelSettings(worth="beauty")
 
 
 def test_grasps_off_the_manifold_are_dropped_by_contact_and_kept_by_pose(contact, toy_hand):

@@ -152,6 +152,7 @@ def test_what_is_too_heavy_is_no_label(closer, grasps, ball):
         # Closing again moves contacts by microns.
         sure = (held - between).abs() > 0.05 * between
         assert torch.equal(good[sure], (held > between)[sure]) and (quality[~good] == 0).all()
+    torch.testing.assert_close(Truth(closer, [ball], HERE, up=up).capacity(grasps), held.double(), rtol=0.05, atol=1e-3)
     heavy = dataclasses.replace(ball, volume=100 * ball.volume)
     lighter = Truth(closer, [heavy], HERE, up=up).outcome(grasps).capacity
     torch.testing.assert_close(lighter * 1.0, held * max(0.05, 500 * ball.volume) / 1.0, rtol=1e-3, atol=1e-6)

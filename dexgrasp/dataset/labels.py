@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dexgrasp.batch import Batch
+from dexgrasp.errors import DexgraspError
 from dexgrasp.grasps import Grasps
 from dexgrasp.representation import Representation, Targets
 from dexgrasp.sampling import farthest_points
@@ -32,11 +33,18 @@ class LabelSettings:
     """Most that the contact's normal may differ from the point's estimated one, rad."""
     tries: int = 12
     """Pairs of grasp and finger tried at each point, best first."""
+    worth: str = "epsilon"
+    """What makes a grasp good: `capacity`, the weight that it holds (`load_capacity.lifts`), or `epsilon`."""
     support: bool = True
-    """Best is the grasp with the most quality among grasps like it (`support`), else the one of best quality."""
+    """Best is the grasp with the most worth among grasps like it (`support`), else the one of most worth."""
     points: int | None = 2048
     """Only so many points of a view are labelled: the farthest-point samples, among which backbones choose their seeds
     in the same order; None: all."""
+
+    def __post_init__(self) -> None:
+        if self.worth not in ("capacity", "epsilon"):
+            remedy = "set dataset.labels.points.worth to one of them"
+            raise DexgraspError("labels.points.worth: capacity or epsilon", repr(self.worth), remedy)
 
 
 @dataclass(frozen=True)
@@ -85,11 +93,13 @@ def label(
     representation: Representation,
     check: Check,
     settings: LabelSettings | None = None,
+    worth: Float[Tensor, "G"] | None = None,
 ) -> Labels:
     """Label the points of a view with grasps of its scene (camera frame; `grasps.object` as `view.instance`).
 
-    At each point, the pairs of a grasp and a finger whose contact is near and whose normal agrees are tried, best
-    quality first: told at the point with its estimated normal, decoded, checked. The first that is true labels it.
+    At each point, the pairs of a grasp and a finger whose contact is near and whose normal agrees are tried, those of
+    most `worth` first (None: the grasps' quality): told at the point with its estimated normal, decoded, checked. The
+    first that is true labels it.
     """
     settings = settings or LabelSettings()
     fingers = grasps.contacts.shape[1]
@@ -98,7 +108,8 @@ def label(
         chosen = farthest_points(view.points, settings.points).sort().values
     asked = View(view.points[chosen], view.normals[chosen], view.instance[chosen], view.world_T_camera)
     point, touched = near_pairs(asked, grasps, settings)
-    worth = support(grasps) if settings.support else grasps.quality
+    worth = grasps.quality if worth is None else worth
+    worth = support(grasps, worth) if settings.support else worth
     best_first = np.lexsort((touched, -worth.numpy()[touched // fingers], point))
     contact = torch.from_numpy(touched[best_first])
     size = torch.from_numpy(np.bincount(point, minlength=len(asked)))

@@ -25,6 +25,7 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
 from dexgrasp.level import levelled
+from dexgrasp.load_capacity import lifts
 from dexgrasp.objects import Object, object_to_tensors
 from dexgrasp.plugins import build_representation
 from dexgrasp.scene import Scene
@@ -154,7 +155,8 @@ def make_labels(dataset: Dataset, index: int) -> Item:
     grasps = dataset.scene_grasps(number).moved(inverse(world_T_level))
     truth = scene_truth(dataset, number, world_T_level)
     representation = build_representation(dataset.representation, dataset.hand, channels=1)
-    found = label(view, grasps, representation, truth.holds, settings.points)
+    worth = lifts(truth.capacity(grasps)).to(grasps.quality) if settings.points.worth == "capacity" else None
+    found = label(view, grasps, representation, truth.holds, settings.points, worth)
     facts = {"points": len(found), "true": int(found.true.sum()), "grasps": len(grasps)}
     return Item(key(index), found.tensors(), facts)
 
