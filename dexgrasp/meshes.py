@@ -56,13 +56,15 @@ def load_folder(
     count: int | None = None,
     threshold: float = 0.005,
     workers: int = 1,
+    suffix: str = "",
 ) -> tuple[list[Object], list[tuple[str, str]]]:
     """Return the objects of a folder, sorted by name, and those left out with the reason.
 
     `layout` is one of `LAYOUTS`, flat or auto; `scale` turns file units into metres (default 1; ShapeNet, whose
     meshes have no unit, needs one); `include` and `exclude` are glob patterns of names; `repair` closes meshes that
     are not watertight and reports by how much the surface moved; `threshold` as in `convex_parts`; `workers`
-    processes share the work. Frames are the files'. Source and licence are those of a ``manifest.json`` (`origins`).
+    processes share the work; `suffix` ends every name, so that one folder can be part of a set at several scales.
+    Frames are the files'. Source and licence are those of a ``manifest.json`` (`origins`).
     Raises DexgraspError where nothing usable is found.
     """
     root = Path(path).expanduser()
@@ -76,7 +78,8 @@ def load_folder(
     for entry, (_, item, _) in zip(entries, results, strict=False):
         if item is not None:
             source, licence = known.get(entry.files[0].resolve(), ("", ""))
-            objects.append(replace(item, source=source or item.source, licence=licence))
+            told = replace(item, source=source or item.source, licence=licence)
+            objects.append(replace(told, name=told.name + suffix))
     skipped = [(name, note) for name, item, note in results if item is None]
     for name, item, note in results:
         if note:

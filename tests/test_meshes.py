@@ -9,6 +9,7 @@ import trimesh
 from dexgrasp.convex import convex_parts, deviation
 from dexgrasp.errors import DexgraspError
 from dexgrasp.meshes import Skip, check_mesh, find_meshes, load_folder, read_mesh
+from dexgrasp.objects import load_objects
 
 
 @pytest.fixture(autouse=True)
@@ -55,6 +56,18 @@ def test_include_exclude_count_scale_and_order(tmp_path: Path) -> None:
     assert [item.name for item in load_folder(**load, include="cup*", count=1)[0]] == ["cup_a"]
     with pytest.raises(DexgraspError, match="included"):
         load_folder(**load, include="spoon*")
+
+
+def test_one_folder_at_two_scales_is_one_set(tmp_path: Path) -> None:
+    _box(tmp_path / "set" / "cup.obj", 80.0)
+    one = {"kind": "folder", "path": str(tmp_path / "set"), "scale": 1e-3}
+    both = load_objects(
+        {"kind": "several", "sets": {"as_is": one, "larger": one | {"scale": 1.3e-3, "suffix": "_large"}}}
+    )
+    assert both.names == ("cup", "cup_large") and {item.family for item in both} == {"cup"}
+    assert both["cup_large"].volume == pytest.approx(1.3**3 * both["cup"].volume)
+    with pytest.raises(DexgraspError, match="different names"):
+        load_objects({"kind": "several", "sets": {"one": one, "other": one}})
 
 
 def test_nothing_usable_is_an_error(tmp_path: Path) -> None:
