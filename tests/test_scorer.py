@@ -1,5 +1,6 @@
 """The scorer: what it sees of a hand's surroundings, and how a network with one proposes."""
 
+import dataclasses
 import math
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from dexgrasp import config as settings
+from dexgrasp import selection
 from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import axis_angle, pose, transform
 from dexgrasp.grasps import Grasps
@@ -15,8 +17,8 @@ from dexgrasp.scorer import COARSE, NEAREST, Scorer, around_reference, coarse_po
 from dexgrasp.selection import Selection
 from dexgrasp.statistics import roc_area
 from dexgrasp.testing.samples import seen
-from dexgrasp.training import scoring
-from dexgrasp.training.scoring import ScorerSettings
+from dexgrasp.training import proposals, scoring
+from dexgrasp.training.scorer_settings import ScorerSettings
 
 OPEN = Selection(depth=None, table=None)
 
@@ -104,7 +106,7 @@ def test_a_network_with_a_scorer_chooses_from_several_answers(tmp_path):
 
 def test_it_learns_from_what_holds_and_leaves_the_network_as_it_is(tmp_path, monkeypatch, tiny):
     """Dataset and network are real and small; what meets the cloud counts too, or an untrained network has nothing."""
-    monkeypatch.setattr(scoring, "free", lambda hand, shape, grasps, *_: torch.ones(len(grasps), dtype=torch.bool))
+    monkeypatch.setattr(proposals, "free", lambda hand, shape, grasps, *_: torch.ones(len(grasps), dtype=torch.bool))
     dataset, model = tiny[1], network(2048)
     save_model(tmp_path / "model.safetensors", model)
     told = ScorerSettings(choices=2, most=200, per_view=60, epochs=2, batch=32)
@@ -119,8 +121,32 @@ def test_it_learns_from_what_holds_and_leaves_the_network_as_it_is(tmp_path, mon
     assert all(torch.equal(found[0][key], value) for key, value in before.items()), "the network is as it was"
 
 
+def test_it_tries_what_it_would_choose_itself(tmp_path, monkeypatch, tiny):
+    """One grasp of each object in each view, the best of those told there, is executed and added to what is known."""
+    for where in (proposals, selection):
+        monkeypatch.setattr(where, "free", lambda hand, shape, grasps, *_: torch.ones(len(grasps), dtype=torch.bool))
+    dataset, model = tiny[1], network(2048)
+    save_model(path := tmp_path / "model.safetensors", model)
+    told = ScorerSettings(choices=2, most=200, per_view=60, epochs=1, batch=32, chosen=1)
+    once = scoring.fit_scorer(model, path, dataset, told, 0, 1)
+    save_model(path, model)
+    views = dataset.split("train")[:3]
+    own = [proposals.propose(path, dataset, [view], told, 0, 1, "own", own=True) for view in views]
+    for view, part in zip(views, own, strict=True):
+        seen = dataset.view(view).instance
+        assert 1 <= len(part) <= len(seen[seen >= 0].unique()) and not part.lifted.isnan().any()
+        with torch.no_grad():
+            rest = proposals.propose(path, dataset, [view], told, 0, 1, "some")
+            best = model.scorer(part.features, part.at, scoring._grasps(part), part.around).max()
+            assert best >= model.scorer(rest.features, rest.at, scoring._grasps(rest), rest.around).max() - 1e-4
+    model.scorer = None
+    save_model(path, model)
+    twice = scoring.fit_scorer(model, path, dataset, dataclasses.replace(told, rounds=2), 0, 1)
+    assert twice.proposals > once.proposals and (twice.chosen is None) == (not dataset.split("validation"))
+
+
 def test_settings_are_checked():
-    for change in ({"choices": 0}, {"clear": (0.1, 0.2)}, {"blocked": (0.1, 0.2, 0.3, 1.5)}):
+    for change in ({"choices": 0}, {"rounds": 0}, {"clear": (0.1, 0.2)}, {"blocked": (0.1, 0.2, 0.3, 1.5)}):
         with pytest.raises(DexgraspError, match=f"scorer.{next(iter(change))}"):
             ScorerSettings(**change)
 

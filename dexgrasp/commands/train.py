@@ -29,7 +29,8 @@ from dexgrasp.seeds import stream
 from dexgrasp.settings import read
 from dexgrasp.training import state
 from dexgrasp.training.loop import device_of, train
-from dexgrasp.training.scoring import ScorerSettings, fit_scorer
+from dexgrasp.training.scorer_settings import ScorerSettings
+from dexgrasp.training.scoring import fit_scorer
 from dexgrasp.training.settings import TrainerSettings
 
 CONFIG = "config.yaml"

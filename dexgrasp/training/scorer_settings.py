@@ -1,0 +1,45 @@
+"""How the scorer is taught."""
+
+from dataclasses import dataclass
+
+from dexgrasp.errors import DexgraspError
+from dexgrasp.simulation.protocol import load_protocol
+
+
+@dataclass(frozen=True)
+class ScorerSettings:
+    """`conf/scorer`; see there for what each value does."""
+
+    choices: int = 3
+    most: int = 640
+    hidden: tuple[int, ...] = (256, 128)
+    around: tuple[int, ...] = (32, 64)
+    per_view: int = 200
+    verdicts: int = 0
+    rounds: int = 1
+    chosen: int = 2
+    protocol: str = "lift-bulk-v1"
+    weight: float = 5.0
+    views: int | None = None
+    epochs: int = 4
+    batch: int = 2048
+    learning_rate: float = 0.004
+    weight_decay: float = 0.01
+    capacity: tuple[float, ...] = (0.5, 1.0, 2.0, 3.0, 5.0)
+    clear: tuple[float, ...] = (0.24, 0.26, 0.41, 0.78, 0.86, 0.91, 0.95)
+    blocked: tuple[float, ...] = (0.21, 0.27, 0.40, 0.63, 0.71, 0.72, 0.77)
+
+    def __post_init__(self) -> None:
+        for name in ("choices", "most", "per_view", "rounds", "chosen", "epochs", "batch"):
+            if getattr(self, name) < 1:
+                raise DexgraspError(f"scorer.{name} of at least 1", str(getattr(self, name)), f"set scorer.{name}")
+        if self.verdicts < 0 or self.weight <= 0:
+            found = f"{self.verdicts}, {self.weight}"
+            raise DexgraspError("scorer.verdicts of at least 0, scorer.weight above it", found, "set them so")
+        load_protocol(self.protocol).on_table("the scorer's verdicts")
+        for name in ("clear", "blocked"):
+            worth, wanted = getattr(self, name), len(self.capacity) + 2
+            if len(worth) != wanted or not all(0 <= value <= 1 for value in worth):
+                raise DexgraspError(f"scorer.{name}: {wanted} shares in 0..1", str(worth), f"set scorer.{name}")
+        if list(self.capacity) != sorted(self.capacity):
+            raise DexgraspError("scorer.capacity in ascending order", str(self.capacity), "set scorer.capacity")
