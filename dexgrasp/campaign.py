@@ -42,7 +42,7 @@ from dexgrasp.sight import Sight
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.statistics import rate_interval
-from dexgrasp.support import support
+from dexgrasp.support import DOUBT, support
 from dexgrasp.table import find_tabletop
 from dexgrasp.wrench_model import WrenchModel
 
@@ -177,7 +177,7 @@ def _work(
         if label_ceilings:
             labels, rules = dataset.scene_grasps(index), (dataset.hand, simulator, campaign.protocol, campaign.seed)
             truth = scene_truth(dataset, index, torch.eye(4, dtype=torch.float64))
-            worth = support(labels, lifts(truth.capacity(labels)))
+            worth = support(labels, lifts(truth.capacity(labels)), DOUBT)
             verdicts = ceilings(index, objects, poses, labels, *rules, fixtures, campaign.oracle, worth)
         told: list[tuple[float, bool]] = []
         network = campaign.network()

@@ -28,6 +28,15 @@ def test_grasps_alike_back_each_other():
     assert worth[1] > worth[3]
 
 
+def test_with_doubt_many_poor_grasps_are_no_good_one():
+    near = grasps([0.0] * 8 + [5.0] * 2, [0] * 10, [0.3] * 8 + [0.9] * 2)
+    summed, mean = support(near, near.quality), support(near, near.quality, 2.0)
+    assert summed.argmax() < 8 and mean.argmax() >= 8
+    torch.testing.assert_close(mean, torch.tensor([8 * 0.3 / 10] * 8 + [2 * 0.9 / 4] * 2).double())
+    lonely = grasps([0.0, 5.0, 5.0, 5.0], [0] * 4, [0.9, 0.8, 0.8, 0.8])
+    assert support(lonely, lonely.quality, 2.0).argmax() > 0
+
+
 def test_objects_do_not_back_each_other():
     apart = backed(grasps([0.0, 0.0], [0, 1], [0.1, 0.2]))
     torch.testing.assert_close(apart, torch.tensor([0.1, 0.2]).double())

@@ -37,6 +37,8 @@ class LabelSettings:
     """What makes a grasp good: `capacity`, the weight that it holds (`load_capacity.lifts`), or `epsilon`."""
     support: bool = True
     """Best is the grasp with the most worth among grasps like it (`support`), else the one of most worth."""
+    doubt: float | None = None
+    """Among grasps like it the mean counts, as if so many more were worth nothing; None: the sum."""
     points: int | None = 2048
     """Only so many points of a view are labelled: the farthest-point samples, among which backbones choose their seeds
     in the same order; None: all."""
@@ -109,7 +111,7 @@ def label(
     asked = View(view.points[chosen], view.normals[chosen], view.instance[chosen], view.world_T_camera)
     point, touched = near_pairs(asked, grasps, settings)
     worth = grasps.quality if worth is None else worth
-    worth = support(grasps, worth) if settings.support else worth
+    worth = support(grasps, worth, settings.doubt) if settings.support else worth
     best_first = np.lexsort((touched, -worth.numpy()[touched // fingers], point))
     contact = torch.from_numpy(touched[best_first])
     size = torch.from_numpy(np.bincount(point, minlength=len(asked)))
