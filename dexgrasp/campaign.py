@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dexgrasp.ceilings import ceilings
-from dexgrasp.child import start_worker
+from dexgrasp.child import in_workers
 from dexgrasp.dataset.camera import MeshScene, Viewpoints
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.framing import Framing
@@ -77,9 +77,8 @@ class Campaign:
         The verdicts do not depend on the number of workers.
         """
         count = self.dataset.scenes
-        parallel = joblib.Parallel(n_jobs=workers, return_as="generator", initializer=start_worker)
         jobs = (joblib.delayed(_work)(self, index, label_ceilings) for index in range(count))
-        done = list(track(parallel(jobs), f"evaluation, {self.protocol.name}", total=count))
+        done = list(track(in_workers(jobs, workers), f"evaluation, {self.protocol.name}", total=count))
         episodes = [episode for episode, _, _ in done]
         results: dict[str, Any] = {
             "protocol": str(self.protocol),

@@ -2,6 +2,10 @@
 
 import ctypes
 import signal
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import joblib
 
 ROOM = 8 << 30
 """Bytes by which a worker may grow."""
@@ -23,3 +27,8 @@ def start_worker() -> None:
 
     if hasattr(process_executor, "_MAX_MEMORY_LEAK_SIZE"):
         process_executor._MAX_MEMORY_LEAK_SIZE = ROOM
+
+
+def in_workers(jobs: Iterable[Any], workers: int) -> Iterator[Any]:
+    """Yield the results of joblib's delayed `jobs`, in their order, as so many worker processes make them."""
+    yield from joblib.Parallel(n_jobs=workers, return_as="generator", initializer=start_worker)(jobs)

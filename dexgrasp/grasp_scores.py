@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from dexgrasp.child import start_worker
+from dexgrasp.child import in_workers
 from dexgrasp.collision import HandShape
 from dexgrasp.dataset.clutter import Approach
 from dexgrasp.dataset.shard import Item
@@ -88,8 +88,7 @@ class Scoring:
     def run(self, bodies: Sequence[tuple[Object, Grasps]], workers: int) -> list[Scored]:
         """Score the grasps of each object; the result does not depend on the number of workers."""
         jobs = (joblib.delayed(_work)(self, item, grasps) for item, grasps in bodies)
-        parallel = joblib.Parallel(n_jobs=workers, return_as="generator", initializer=start_worker)
-        return list(track(parallel(jobs), "scoring", total=len(bodies)))
+        return list(track(in_workers(jobs, workers), "scoring", total=len(bodies)))
 
     def score(self, item: Object, grasps: Grasps) -> Scored:
         """Score the grasps (object frame) of one object."""

@@ -11,7 +11,7 @@ import joblib
 import numpy as np
 import trimesh
 
-from dexgrasp.child import start_worker
+from dexgrasp.child import in_workers
 from dexgrasp.convex import convex_parts
 from dexgrasp.errors import DexgraspError
 from dexgrasp.objects import Object
@@ -70,9 +70,7 @@ def load_folder(
     root = Path(path).expanduser()
     entries = find_entries(path, layout, scale, include, exclude, count)
     jobs = (joblib.delayed(_load)(entry, repair, threshold) for entry in entries)
-    results: list[tuple[str, Object | None, str]] = list(
-        joblib.Parallel(n_jobs=workers, initializer=start_worker)(jobs)
-    )
+    results: list[tuple[str, Object | None, str]] = list(in_workers(jobs, workers))
     known = origins(root)
     objects = []
     for entry, (_, item, _) in zip(entries, results, strict=False):

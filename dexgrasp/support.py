@@ -10,8 +10,8 @@ LIKE_DISTANCE, LIKE_ANGLE = 0.02, 0.3
 """Scale on which two grasps are alike: bases apart, m; rotations and joints apart, rad."""
 
 DOUBT = 2.0
-"""Grasps like a best one that are taken to fail. Of 416 objects in clutter `lift-v1` lifted 92.3 % at the grasp with the
-largest sum of `load_capacity.lifts`, 95.2 % at the one with the largest mean with this doubt."""
+"""Grasps like a best one that are taken to fail. Of 416 objects in clutter `lift-v1` lifted 92.3 % at the grasp with
+the largest sum of `load_capacity.lifts`, 95.2 % at the one with the largest mean with this doubt."""
 
 
 def support(grasps: Grasps, worth: Float[Tensor, "N"], doubt: float | None = None) -> Float[Tensor, "N"]:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dexgrasp.batch import Batch
-from dexgrasp.child import start_worker
+from dexgrasp.child import in_workers
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.stages import scene_truth
 from dexgrasp.dataset.verdicts import verify_scene
@@ -69,10 +69,9 @@ def propose(
     Random proposals, some of them executed; with `own` those that the network's scorer thinks best of each object, all
     executed. `label` is for the progress bar.
     """
-    parallel = joblib.Parallel(n_jobs=workers, return_as="generator", initializer=start_worker)
     stamp = path.stat().st_mtime_ns
     jobs = (joblib.delayed(_of_view)(path, stamp, dataset, view, settings, seed, own) for view in views)
-    return Proposals.cat(list(track(parallel(jobs), label, total=len(views))))
+    return Proposals.cat(list(track(in_workers(jobs, workers), label, total=len(views))))
 
 
 @torch.no_grad()
