@@ -210,7 +210,7 @@ def sight(view: View, seed: int) -> Sight:
     points, normals = view.points.double().numpy(), view.normals.double().numpy()
     table = find_tabletop(torch.from_numpy(np.hstack([points, normals])), seed)
     known = None if table is None else table.numpy()
-    return Sight(points, normals, clusters(points, known), known, np.eye(4))
+    return Sight(points, normals, clusters(points, known, normals), known, np.eye(4))
 
 
 @lru_cache(1)

@@ -5,10 +5,9 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
+from dexgrasp.concavity import pieces
+from dexgrasp.connected import connected
 from dexgrasp.errors import DexgraspError
 
 Array = NDArray[np.float64]
@@ -26,10 +25,11 @@ FEWEST = 40
 """Cubes of the smallest object."""
 
 
-def clusters(points: Array, table_T_camera: Array | None) -> Labels:
+def clusters(points: Array, table_T_camera: Array | None, normals: Array | None = None) -> Labels:
     """Return the object of each point, the largest first, -1 for the table and for what is too small.
 
-    Euclidean clustering (Rusu 2009) of what is above the table; of everything where no table is seen.
+    Euclidean clustering (Rusu 2009) of what is above the table; of everything where no table is seen. With outward
+    `normals` (P, 3), things that touch are told apart where the surface between them is concave.
     """
     labels = np.full(len(points), -1)
     if table_T_camera is None:
@@ -40,7 +40,10 @@ def clusters(points: Array, table_T_camera: Array | None) -> Labels:
     if not inside.any():
         return labels
     first, owner = thinned(points[inside], CELL)
-    found = grown(points[inside][first], GAP)
+    cells = points[inside][first]
+    found = connected(cells, GAP)
+    if normals is not None:
+        found = _parted(cells, normals[inside][first], found)
     sizes = np.bincount(found)
     order = np.argsort(-sizes, kind="stable")
     rank = np.full(len(sizes), -1)
@@ -50,11 +53,15 @@ def clusters(points: Array, table_T_camera: Array | None) -> Labels:
     return labels
 
 
-def grown(points: Array, gap: float) -> Labels:
-    """Return connected pieces: points nearer than `gap` (m) are connected."""
-    pairs = cKDTree(points).query_pairs(gap, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+def _parted(points: Array, normals: Array, found: Labels) -> Labels:
+    """Return what hangs together cut into its `pieces`."""
+    result, count = found.copy(), int(found.max()) + 1
+    for number in range(count):
+        own = np.flatnonzero(found == number)
+        piece = pieces(points[own], normals[own], FEWEST)
+        result[own[piece > 0]] = count + piece[piece > 0] - 1
+        count += int(piece.max())
+    return result
 
 
 def thinned(points: Array, side: float) -> tuple[Labels, Labels]:
@@ -69,10 +76,10 @@ def thinned(points: Array, side: float) -> tuple[Labels, Labels]:
     return first, owner.reshape(-1)
 
 
-def load_segmenter(name: str | None) -> Segmenter:
-    """Return the function that ``module:function`` names; ours for None. Raises DexgraspError where there is none."""
+def load_segmenter(name: str | None) -> Segmenter | None:
+    """Return the function that ``module:function`` names; None for None. Raises DexgraspError where there is none."""
     if name is None:
-        return clusters
+        return None
     module, _, function = name.partition(":")
     try:
         found = getattr(importlib.import_module(module), function)

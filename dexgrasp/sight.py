@@ -59,7 +59,7 @@ def see(
     captures: Sequence[Capture],
     poses: Array | None = None,
     viewpoint: Array | None = None,
-    segmenter: Segmenter = clusters,
+    segmenter: Segmenter | None = None,
     mask: Sequence[NDArray[np.bool_] | None] = (),
     up: Array | None = None,
     seed: int = 0,
@@ -70,7 +70,7 @@ def see(
         captures: what each camera saw, in its own frame.
         poses: (V, 4, 4) told_T_camera of each, m; None for a single view.
         viewpoint: (3,) where the camera stood, in the frame of a single cloud that is not in its camera's.
-        segmenter: see `dexgrasp.segmentation`.
+        segmenter: see `dexgrasp.segmentation`; None: `clusters`.
         mask: per capture, (total,) which rows or pixels of its file are the target, which becomes object 0.
         up: (3,) against gravity in the frame of the poses (or of the single camera), where it is known.
         seed: of the search for the table.
@@ -101,7 +101,7 @@ def see(
     along = None if up is None else torch.from_numpy(camera_T_told[:3, :3] @ up)
     found = find_tabletop(torch.from_numpy(np.hstack([cloud, directions])), seed, along)
     table = None if found is None else found.numpy()
-    labels = segmenter(cloud, table)
+    labels = clusters(cloud, table, directions) if segmenter is None else segmenter(cloud, table)
     if any(wanted is not None for wanted in mask):
         if not target.any():
             raise DexgraspError("a mask that marks measured points", "no point under it", "check the mask")

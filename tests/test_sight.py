@@ -96,7 +96,7 @@ def test_what_is_no_cloud_in_metres_is_refused():
 
 
 def test_segmenters_are_named_and_checked():
-    assert load_segmenter(None) is clusters
+    assert load_segmenter(None) is None
     for name, message in (("nowhere:none", "nowhere"), ("numpy:pi", "no function"), ("numpy:mean", "whole numbers")):
         with pytest.raises(DexgraspError, match=message):
             load_segmenter(name)(np.zeros((5, 3)), None)
