@@ -132,7 +132,7 @@ def _card(
     yield f"- seed {facts.get('seed', 'not known')}, {facts.get('steps', 'an unknown number of')} steps"
     overrides = run / ".hydra" / "overrides.yaml"
     if overrides.is_file():
-        words = [str(word) for word in OmegaConf.load(overrides)]
+        words = [re.sub(r"=/[^\s,\]]+", "=DIR", str(word)) for word in OmegaConf.load(overrides)]
         yield f"- `python -m dexgrasp train {' '.join(words)}`".rstrip("` ") + "`"
     yield from ("", "## Data and licences", "")
     yield from _data(config) if isinstance(config, DictConfig) else ["Not known: no config lies beside the weights."]
@@ -158,7 +158,11 @@ def _set(objects: Mapping[str, Any]) -> Iterator[str]:
         return
     told = [licence for file, (_, licence) in origins(Path(str(objects["path"]))).items() if _taken(file.stem, objects)]
     counted = Counter(licence or "not stated" for licence in told)
-    yield f"Objects: {len(told) or 'an unknown number of'} meshes of the folder `{Path(str(objects['path'])).name}`. "
+    scale = objects.get("scale") or 1
+    yield (
+        f"Objects: {len(told) or 'an unknown number of'} meshes of the folder `{Path(str(objects['path'])).name}`"
+        f"{'' if scale == 1 else f', scaled by {scale:g}'}. "
+    )
     yield "; ".join(f"{count}: {licence}" for licence, count in counted.most_common()) or "Licences: not stated."
 
 

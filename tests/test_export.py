@@ -75,9 +75,12 @@ def test_in_double_precision_no_choice_falls_otherwise(model, tmp_path):
 def test_weights_load_by_name_and_carry_a_card(model, tmp_path, monkeypatch):
     save_model(tmp_path / "run" / "model.safetensors", model, {"seed": 3, "steps": 7})
     (tmp_path / "run" / "results.json").write_text('{"scorer": {"area": 0.75}}')
+    (tmp_path / "run" / ".hydra").mkdir()
+    (tmp_path / "run" / ".hydra" / "overrides.yaml").write_text("- hand=barrett\n- meshes=/home/somebody/meshes\n")
     card = shipping.ship(tmp_path / "run" / "model.safetensors", "tiny", tmp_path / "weights", half=True, views=2)
     text = card.read_text()
     assert "seed 3, 7 steps" in text and "half precision" in text and "0.750" in text and "Not evaluated" in text
+    assert "train hand=barrett meshes=DIR`" in text and "somebody" not in text
     full, half = (f.stat().st_size for f in (tmp_path / "run/model.safetensors", card.with_suffix(".safetensors")))
     assert half < 0.75 * full
     monkeypatch.setattr(checkpoint, "WEIGHTS", tmp_path / "weights")
