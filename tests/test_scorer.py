@@ -145,6 +145,23 @@ def test_it_tries_what_it_would_choose_itself(tmp_path, monkeypatch, tiny):
     assert twice.proposals > once.proposals and (twice.chosen is None) == (not dataset.split("validation"))
 
 
+def test_it_begins_with_the_one_that_a_network_had(tmp_path, monkeypatch, tiny):
+    monkeypatch.setattr(proposals, "free", lambda hand, shape, grasps, *_: torch.ones(len(grasps), dtype=torch.bool))
+    dataset, model = tiny[1], network(2048)
+    save_model(path := tmp_path / "model.safetensors", model)
+    told = ScorerSettings(choices=2, most=200, per_view=60, epochs=1, batch=32)
+    scoring.fit_scorer(model, path, dataset, told, 0, 1)
+    had, model.scorer = model.scorer, None
+    still = dataclasses.replace(told, learning_rate=1e-9)
+    scoring.fit_scorer(model, path, dataset, still, 1, 1, had)
+    weights = model.scorer.state_dict()
+    for name, value in had.state_dict().items():  # statistics of the norms are measured anew
+        if "running" not in name and "tracked" not in name:
+            torch.testing.assert_close(weights[name], value, atol=1e-5, rtol=1e-5)
+    scoring.fit_scorer(model, path, dataset, dataclasses.replace(still, hidden=(32,)), 1, 1, had)
+    assert model.scorer.options["hidden"] == [32], "of another size it begins with nothing"
+
+
 def test_settings_are_checked():
     for change in ({"choices": 0}, {"rounds": 0}, {"clear": (0.1, 0.2)}, {"blocked": (0.1, 0.2, 0.3, 1.5)}):
         with pytest.raises(DexgraspError, match=f"scorer.{next(iter(change))}"):

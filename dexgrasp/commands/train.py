@@ -22,7 +22,7 @@ from dexgrasp.dataset.store import digest
 from dexgrasp.errors import DexgraspError
 from dexgrasp.hand_table import grasp_yield, write_hand_table
 from dexgrasp.level import levelled
-from dexgrasp.model import GraspNet, build_model, save_model
+from dexgrasp.model import GraspNet, build_model, load_model, save_model
 from dexgrasp.report import write_results
 from dexgrasp.representation import Targets
 from dexgrasp.seeds import stream
@@ -99,7 +99,8 @@ def _run(config: DictConfig, folder: Path, began: float) -> None:
     save_model(folder / FILE, model.cpu(), facts)
     if scoring is not None:
         workers = config.dataset.workers or joblib.cpu_count()
-        scored = fit_scorer(model, folder / FILE, dataset, scoring, config.seed, workers)
+        before = None if config.init_from is None else load_model(find_checkpoint(config.init_from)).scorer
+        scored = fit_scorer(model, folder / FILE, dataset, scoring, config.seed, workers, before)
         results["scorer"] = dataclasses.asdict(scored)
         results["times"]["scorer"] = scored.seconds
         # Without the time that it took: a run that was interrupted ends with the same file.

@@ -43,22 +43,29 @@ class ScorerSummary:
 
 
 def fit_scorer(
-    model: GraspNet, path: Path, dataset: Dataset, settings: ScorerSettings, seed: int, workers: int
+    model: GraspNet,
+    path: Path,
+    dataset: Dataset,
+    settings: ScorerSettings,
+    seed: int,
+    workers: int,
+    start: Scorer | None = None,
 ) -> ScorerSummary:
     """Give `model` (on the CPU, as it lies at `path`) a scorer taught on the dataset's training views.
 
-    The result does not depend on the number of workers.
+    `start`, where it is of the same size, is what it begins with, else it begins with nothing. The result does not
+    depend on the number of workers.
     """
     began = time.perf_counter()
     views = dataset.split("train")[: settings.views]
     known = propose(path, dataset, views, settings, seed, workers, "scorer")
     if not len(known):  # nothing to learn from: the heads' own score stays
         return ScorerSummary(0, 0.0, time.perf_counter() - began)
-    model.scorer = scorer = _fitted(model, known, settings, seed)
+    model.scorer = scorer = _fitted(model, known, settings, seed, start)
     for turn in range(1, settings.rounds):
         told = f"scorer, its own choice {turn}"
         known = Proposals.cat([known, _choose(model, dataset, views, settings, seed, workers, told)])
-        model.scorer = scorer = _fitted(model, known, settings, seed)
+        model.scorer = scorer = _fitted(model, known, settings, seed, start)
     area = before = verdicts = own = None
     if unseen := dataset.split("validation"):
         rest = propose(path, dataset, unseen, settings, seed, workers, "scorer, validation")
@@ -88,13 +95,21 @@ def _reliable(told: Float[Tensor, "N"], known: Proposals) -> dict[str, Any] | No
     return reliability(told[tried].sigmoid(), known.lifted[tried] > 0) if tried.any() else None
 
 
-def _fitted(model: GraspNet, known: Proposals, settings: ScorerSettings, seed: int) -> Scorer:
-    """Return a scorer that has learnt what is known, from nothing."""
+def _fitted(
+    model: GraspNet, known: Proposals, settings: ScorerSettings, seed: int, start: Scorer | None = None
+) -> Scorer:
+    """Return a scorer that has learnt what is known, from `start` where it is of the same size."""
     torch.manual_seed(int(stream(seed, "scorer").integers(2**31)))
     options = settings.choices, settings.most, settings.hidden, settings.around
     scorer = Scorer(model.hand, known.features.shape[1], *options)
+    if start is not None and _sizes(start) == _sizes(scorer):
+        scorer.load_state_dict(start.state_dict())
     _fit(scorer, known, settings, seed)
     return scorer
+
+
+def _sizes(scorer: Scorer) -> dict[str, torch.Size]:
+    return {name: value.shape for name, value in scorer.state_dict().items()}
 
 
 def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) -> None:
