@@ -153,7 +153,7 @@ def test_a_killed_holder_frees_the_lock(tmp_path: Path) -> None:
     context = multiprocessing.get_context("fork")
     run = context.Process(target=_hold, args=(tmp_path / "store", tmp_path / "log"))
     run.start()
-    while not (tmp_path / "log").exists():
+    while not (tmp_path / "log").exists() or not (tmp_path / "log").read_text():
         time.sleep(0.01)
     assert run.pid
     os.kill(run.pid, 9)
