@@ -10,6 +10,7 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.model import GraspNet
 from dexgrasp.plugins import load_backbone, load_hand, load_representation
 from dexgrasp.representation import Targets
+from dexgrasp.training.calibration import calibrate, validate
 from dexgrasp.training.feed import Feed
 from dexgrasp.training.loop import train
 from dexgrasp.training.settings import TrainerSettings, order, schedule
@@ -54,6 +55,18 @@ def same(a, b, **tolerance):
     assert a.keys() == b.keys()
     for key in a:
         torch.testing.assert_close(a[key], b[key], **(tolerance or {"rtol": 0, "atol": 0}), msg=key)
+
+
+def test_what_is_measured_at_the_end_does_not_depend_on_the_number_of_threads(samples):
+    model, seen, before = network(), set(), torch.get_num_threads()
+    model.backbone.register_forward_hook(lambda *_: seen.add(torch.get_num_threads()))
+    torch.set_num_threads(2)
+    try:
+        calibrate(model, samples, SETTINGS, 0, torch.device("cpu"))
+        validate(model, samples, SETTINGS, torch.device("cpu"))
+        assert seen == {1} and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])

@@ -5,9 +5,11 @@ from torch import nn
 
 from dexgrasp.dataset.samples import Samples
 from dexgrasp.model import GraspNet
+from dexgrasp.threads import one_thread
 from dexgrasp.training.settings import TrainerSettings, order
 
 
+@one_thread()
 @torch.no_grad()
 def calibrate(model: GraspNet, samples: Samples, settings: TrainerSettings, seed: int, device: torch.device) -> None:
     """Measure the batch norms' running statistics for the present weights over some micro-batches."""
@@ -26,6 +28,7 @@ def calibrate(model: GraspNet, samples: Samples, settings: TrainerSettings, seed
     model.eval()
 
 
+@one_thread()
 @torch.no_grad()
 def validate(model: GraspNet, samples: Samples, settings: TrainerSettings, device: torch.device) -> dict[str, float]:
     """Return the mean of every loss term over a split, in eval mode."""

@@ -20,6 +20,7 @@ from dexgrasp.reliability import reliability
 from dexgrasp.scorer import Scorer
 from dexgrasp.seeds import stream, torch_stream
 from dexgrasp.statistics import roc_area
+from dexgrasp.threads import one_thread
 from dexgrasp.training.proposals import Proposals, propose
 from dexgrasp.training.scorer_settings import ScorerSettings
 
@@ -84,6 +85,7 @@ def fit_scorer(
     return ScorerSummary(len(known), holding, seconds, area, before, verdicts, own)
 
 
+@one_thread()
 @torch.no_grad()
 def _told_by(scorer: Scorer, known: Proposals) -> Float[Tensor, "N"]:
     return scorer(known.features, known.at, _grasps(known), known.around)
@@ -112,9 +114,8 @@ def _sizes(scorer: Scorer) -> dict[str, torch.Size]:
     return {name: value.shape for name, value in scorer.state_dict().items()}
 
 
+@one_thread()
 def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) -> None:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # sums that are cut up otherwise end in other bits
     scorer.train()
     optimizer = torch.optim.AdamW(scorer.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
     size = min(settings.batch, len(known))
@@ -135,7 +136,6 @@ def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) 
             optimizer.step()
             schedule.step()
     scorer.eval()
-    torch.set_num_threads(threads)
 
 
 def _grasps(known: Proposals) -> Grasps:
