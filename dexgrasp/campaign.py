@@ -44,6 +44,7 @@ from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.statistics import rate_interval
 from dexgrasp.support import DOUBT, support
 from dexgrasp.table import find_tabletop
+from dexgrasp.threads import one_thread
 from dexgrasp.wrench_model import WrenchModel
 
 
@@ -161,48 +162,44 @@ class Campaign:
         return float(model.epsilon(closure.contacts, closure.normals).values[0])
 
 
+@one_thread()
 def _work(
     campaign: Campaign, index: int, label_ceilings: bool
 ) -> tuple[Episode, dict[str, list[bool]], list[tuple[float, bool]]]:
     """One scene; the worker's only entry."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        dataset = campaign.dataset
-        simulator = MujocoSimulator(dataset.config["simulator"]["settling"])
-        objects = [dataset.objects[name] for name in dataset.scene(index).objects]
-        poses, fixtures = dataset.scene(index).poses.double(), dataset.scene(index).fixtures
-        verdicts: dict[str, list[bool]] = {}
-        if label_ceilings:
-            labels, rules = dataset.scene_grasps(index), (dataset.hand, simulator, campaign.protocol, campaign.seed)
-            truth = scene_truth(dataset, index, torch.eye(4, dtype=torch.float64))
-            worth = support(labels, lifts(truth.capacity(labels)), DOUBT)
-            verdicts = ceilings(index, objects, poses, labels, *rules, fixtures, campaign.oracle, worth)
-        told: list[tuple[float, bool]] = []
-        network = campaign.network()
-        if campaign.reliability and network is not None:
-            seed = int(stream(campaign.seed, "reliability", index).integers(2**31))
-            what = network, campaign.look(index, objects, poses, seed), campaign.selection, campaign.reliability
-            told = trials(*what, objects, poses, simulator, campaign.protocol, seed, fixtures)
-        episode = clear(
-            index,
-            objects,
-            poses,
-            dataset.hand,
-            partial(campaign.look, index),
-            campaign.predict,
-            simulator,
-            campaign.protocol,
-            campaign.policy,
-            campaign.seed,
-            campaign.reached,
-            draw=index < campaign.drawn,
-            fixtures=fixtures,
-            least=campaign.least,
-        )
-        return episode, verdicts, told
-    finally:
-        torch.set_num_threads(threads)
+    dataset = campaign.dataset
+    simulator = MujocoSimulator(dataset.config["simulator"]["settling"])
+    objects = [dataset.objects[name] for name in dataset.scene(index).objects]
+    poses, fixtures = dataset.scene(index).poses.double(), dataset.scene(index).fixtures
+    verdicts: dict[str, list[bool]] = {}
+    if label_ceilings:
+        labels, rules = dataset.scene_grasps(index), (dataset.hand, simulator, campaign.protocol, campaign.seed)
+        truth = scene_truth(dataset, index, torch.eye(4, dtype=torch.float64))
+        worth = support(labels, lifts(truth.capacity(labels)), DOUBT)
+        verdicts = ceilings(index, objects, poses, labels, *rules, fixtures, campaign.oracle, worth)
+    told: list[tuple[float, bool]] = []
+    network = campaign.network()
+    if campaign.reliability and network is not None:
+        seed = int(stream(campaign.seed, "reliability", index).integers(2**31))
+        what = network, campaign.look(index, objects, poses, seed), campaign.selection, campaign.reliability
+        told = trials(*what, objects, poses, simulator, campaign.protocol, seed, fixtures)
+    episode = clear(
+        index,
+        objects,
+        poses,
+        dataset.hand,
+        partial(campaign.look, index),
+        campaign.predict,
+        simulator,
+        campaign.protocol,
+        campaign.policy,
+        campaign.seed,
+        campaign.reached,
+        draw=index < campaign.drawn,
+        fixtures=fixtures,
+        least=campaign.least,
+    )
+    return episode, verdicts, told
 
 
 def sight(view: View, seed: int) -> Sight:

@@ -33,8 +33,10 @@ def pieces(points: Array, normals: Array, fewest: int) -> Labels:
     `normals` point outwards. Points are evenly thinned, some millimetres apart; no piece has less than `fewest`.
     """
     one = np.zeros(len(points), dtype=np.int64)
+    if len(points) < 2 * fewest:
+        return one
     pairs = cKDTree(points).query_pairs(NEAR, output_type="ndarray")
-    if len(points) < 2 * fewest or not len(pairs):
+    if not len(pairs):
         return one
     facing = _facing(points, _smoothed(normals, pairs), pairs)
     every, some = (np.bincount(part.ravel(), minlength=len(points)) for part in (pairs, pairs[facing]))

@@ -27,6 +27,7 @@ from dexgrasp.seeds import stream
 from dexgrasp.simulation.mujoco import MujocoSimulator
 from dexgrasp.simulation.protocol import Protocol
 from dexgrasp.statistics import rate_interval
+from dexgrasp.threads import one_thread
 
 FLOATING = 1.0
 """Objects of protocols without a table float this high above it, m."""
@@ -102,13 +103,9 @@ class Scoring:
         return Scored(item, judged, grasp_metrics(self.hand, shape, item, surface, told, physics), told)
 
 
+@one_thread()
 def _work(scoring: Scoring, item: Object, grasps: Grasps) -> Scored:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        return scoring.score(item, grasps)
-    finally:
-        torch.set_num_threads(threads)
+    return scoring.score(item, grasps)
 
 
 def summary(scored: Sequence[Scored], protocol: Protocol, seed: int) -> dict[str, Any]:

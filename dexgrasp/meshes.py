@@ -76,8 +76,8 @@ def load_folder(
     for entry, (_, item, _) in zip(entries, results, strict=False):
         if item is not None:
             source, licence = known.get(entry.files[0].resolve(), ("", ""))
-            told = replace(item, source=source or item.source, licence=licence)
-            objects.append(replace(told, name=told.name + suffix))
+            name, source = item.name + suffix, source or item.source
+            objects.append(replace(item, name=name, source=source, licence=licence))
     skipped = [(name, note) for name, item, note in results if item is None]
     for name, item, note in results:
         if note:

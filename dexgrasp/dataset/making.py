@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import joblib
-import torch
 
 from dexgrasp.dataset.claims import claim, lock
 from dexgrasp.dataset.shard import Item, Shard, shard_name, write_shard
@@ -17,6 +16,7 @@ from dexgrasp.dataset.store import Store, recorded
 from dexgrasp.dataset.temporary import sweep
 from dexgrasp.errors import DexgraspError
 from dexgrasp.progress import track
+from dexgrasp.threads import one_thread
 
 PAUSE = 0.5
 """Seconds between two looks at shards that other runs are making."""
@@ -130,18 +130,14 @@ def _delayed(task: tuple[Any, ...]) -> Any:
     return joblib.delayed(make_shard)(*task)
 
 
+@one_thread()
 def make_shard(folder: Path, index: int, make: Callable[..., Item], inputs: Sequence[Any]) -> tuple[int, Shard | None]:
     """Make one shard, or find it made; None where another process is at it. The workers' only entry."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # workers share the cores, and one thread gives the same bits everywhere
-    try:
-        with claim(folder / f".{shard_name(index)}.claim") as ours:
-            if not ours:
-                return index, None
-            made = recorded(folder, index)
-            if made is None:
-                items = (make(*value) if isinstance(value, tuple) else make(value) for value in inputs)
-                made = write_shard(folder, index, items)
-            return index, made
-    finally:
-        torch.set_num_threads(threads)
+    with claim(folder / f".{shard_name(index)}.claim") as ours:
+        if not ours:
+            return index, None
+        made = recorded(folder, index)
+        if made is None:
+            items = (make(*value) if isinstance(value, tuple) else make(value) for value in inputs)
+            made = write_shard(folder, index, items)
+        return index, made

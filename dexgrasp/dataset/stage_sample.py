@@ -8,13 +8,13 @@ from typing import Any
 
 import joblib
 import numpy as np
-import torch
 from numba.core.event import install_timer
 
 from dexgrasp.dataset import pipeline
 from dexgrasp.dataset.dataset import Dataset
 from dexgrasp.dataset.shard import Item, write_shard
 from dexgrasp.progress import track
+from dexgrasp.threads import one_thread
 
 LIGHT = {"synthesis": {"target": 100, "rounds": 4}, "verify": {"per_object": 1}, "scenes": {"lift_tests": 1}}
 """Settings at most so large show all that a worker does for the first time, in a second."""
@@ -99,29 +99,25 @@ def sampled(
     return Sample(list(track(pool(tasks()), f"sample of {name}")))
 
 
+@one_thread()
 def timed(dataset: Dataset, name: str, values: Sequence[Any], folder: Path, number: int) -> Piece:
     """Make and write items; what a worker does."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        once, built = None, dataset.field.made
-        known = len(built)
-        if name not in _warm:
-            _warm.add(name)
-            once, known = _once(dataset, name, values[0]), known + 1  # the first field loads compiled code
-        make = pipeline.work_of(name, {}, dataset).make
-        items, spent, wall, processor = [], [], time.perf_counter(), time.thread_time()
-        for value in values:
-            before, fields = time.thread_time(), len(built)
-            items.append(make(value))
-            spent.append(time.thread_time() - before - sum(seconds for seconds, _ in built[fields:]))
-        before = time.thread_time()
-        write_shard(folder, number, items)
-        writing = (time.thread_time() - before) / len(items)
-        wall, processor = time.perf_counter() - wall, time.thread_time() - processor
-        return Piece(items, tuple(each + writing for each in spent), tuple(built[known:]), processor, wall, once)
-    finally:
-        torch.set_num_threads(threads)
+    once, built = None, dataset.field.made
+    known = len(built)
+    if name not in _warm:
+        _warm.add(name)
+        once, known = _once(dataset, name, values[0]), known + 1  # the first field loads compiled code
+    make = pipeline.work_of(name, {}, dataset).make
+    items, spent, wall, processor = [], [], time.perf_counter(), time.thread_time()
+    for value in values:
+        before, fields = time.thread_time(), len(built)
+        items.append(make(value))
+        spent.append(time.thread_time() - before - sum(seconds for seconds, _ in built[fields:]))
+    before = time.thread_time()
+    write_shard(folder, number, items)
+    writing = (time.thread_time() - before) / len(items)
+    wall, processor = time.perf_counter() - wall, time.thread_time() - processor
+    return Piece(items, tuple(each + writing for each in spent), tuple(built[known:]), processor, wall, once)
 
 
 def _once(dataset: Dataset, name: str, value: Any) -> float:

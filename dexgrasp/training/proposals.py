@@ -24,6 +24,7 @@ from dexgrasp.scorer import COARSE, coarse_points, surroundings
 from dexgrasp.seeds import stream
 from dexgrasp.selection import free, select
 from dexgrasp.simulation.protocol import load_protocol
+from dexgrasp.threads import one_thread
 from dexgrasp.training.scorer_settings import ScorerSettings
 
 DRAWN = 3
@@ -74,6 +75,7 @@ def propose(
     return Proposals.cat(list(track(in_workers(jobs, workers), label, total=len(views))))
 
 
+@one_thread()
 @torch.no_grad()
 def _of_view(
     path: Path, stamp: int, dataset: Dataset, index: int, settings: ScorerSettings, seed: int, own: bool
@@ -82,39 +84,34 @@ def _of_view(
 
     Random ones, some of them executed; with `own` those that the model thinks best of each object, all executed.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        model, hand = _network(path, stamp), dataset.hand
-        view = levelled(dataset.view(index))
-        cloud = torch.cat([view.points, view.normals], dim=1)
-        features, seeds, told = model.told(cloud, choices=settings.choices, most=settings.most)
-        grasps = Grasps.cat(told).replace(object=view.instance[seeds].repeat(len(told)))
-        coarse = coarse_points(cloud, SPREAD)
-        if own:
-            at, around = cloud[seeds].repeat(len(told), 1), surroundings(hand, grasps, coarse[:COARSE])
-            assert model.scorer is not None
-            score = model.scorer(features.repeat(len(told), 1), at, grasps, around)
-            rows = _best(model, grasps.replace(quality=score.sigmoid()), coarse, settings)
-        else:
-            order = torch.from_numpy(stream(seed, "proposals", index).permutation(len(grasps)))
-            rows = _some(model, dataset, grasps, coarse, settings, order)
-        grasps, at = grasps[rows], rows % len(seeds)
-        truth = scene_truth(dataset, dataset.scene_of(index), view.world_T_camera.double())
-        found = truth.outcome(grasps)
-        # 0: one finger or none; else by how many times its weight the object is held.
-        kind = 1 + torch.bucketize(found.capacity, torch.tensor(settings.capacity).to(found.capacity), right=True)
-        kind[found.touched < 2] = 0
-        worth = torch.where(found.clear, torch.tensor(settings.clear)[kind], torch.tensor(settings.blocked)[kind])
-        holds = found.clear & (found.capacity >= max(truth.settings.capacity, 1.0))
-        around = surroundings(hand, grasps, coarse[:COARSE]).half()
-        lifted = torch.full_like(worth, torch.nan)
-        tried = len(grasps) if own else settings.verdicts
-        lifted[:tried] = _executed(dataset, view, grasps[:tried], index, settings.protocol)
-        told_by = features[at], cloud[seeds[at]], grasps.pose, grasps.joints, around, grasps.quality
-        return Proposals(*told_by, worth, lifted, holds)
-    finally:
-        torch.set_num_threads(threads)
+    model, hand = _network(path, stamp), dataset.hand
+    view = levelled(dataset.view(index))
+    cloud = torch.cat([view.points, view.normals], dim=1)
+    features, seeds, told = model.told(cloud, choices=settings.choices, most=settings.most)
+    grasps = Grasps.cat(told).replace(object=view.instance[seeds].repeat(len(told)))
+    coarse = coarse_points(cloud, SPREAD)
+    if own:
+        at, around = cloud[seeds].repeat(len(told), 1), surroundings(hand, grasps, coarse[:COARSE])
+        assert model.scorer is not None
+        score = model.scorer(features.repeat(len(told), 1), at, grasps, around)
+        rows = _best(model, grasps.replace(quality=score.sigmoid()), coarse, settings)
+    else:
+        order = torch.from_numpy(stream(seed, "proposals", index).permutation(len(grasps)))
+        rows = _some(model, dataset, grasps, coarse, settings, order)
+    grasps, at = grasps[rows], rows % len(seeds)
+    truth = scene_truth(dataset, dataset.scene_of(index), view.world_T_camera.double())
+    found = truth.outcome(grasps)
+    # 0: one finger or none; else by how many times its weight the object is held.
+    kind = 1 + torch.bucketize(found.capacity, torch.tensor(settings.capacity).to(found.capacity), right=True)
+    kind[found.touched < 2] = 0
+    worth = torch.where(found.clear, torch.tensor(settings.clear)[kind], torch.tensor(settings.blocked)[kind])
+    holds = found.clear & (found.capacity >= max(truth.settings.capacity, 1.0))
+    around = surroundings(hand, grasps, coarse[:COARSE]).half()
+    lifted = torch.full_like(worth, torch.nan)
+    tried = len(grasps) if own else settings.verdicts
+    lifted[:tried] = _executed(dataset, view, grasps[:tried], index, settings.protocol)
+    told_by = features[at], cloud[seeds[at]], grasps.pose, grasps.joints, around, grasps.quality
+    return Proposals(*told_by, worth, lifted, holds)
 
 
 def _some(
