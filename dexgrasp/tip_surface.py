@@ -17,6 +17,8 @@ SAMPLES = 1500
 """Points drawn on each fingertip's surface, by which its touching part is found."""
 FLAT = 4e-4
 """What is lower than the farthest point by less than about this touches too: its middle is told, m."""
+BLOCK = 128
+"""Directions that are looked at together: their heights stay in the cache."""
 
 
 class TipSurface:
@@ -44,10 +46,11 @@ class TipSurface:
             if not len(corners):
                 found[rows] = radius * towards
                 continue
-            height = (towards @ corners.to(directions).T).amax(-1, keepdim=True)
-            below = height - towards @ points.to(directions).T
-            middle = (-below / FLAT).softmax(-1) @ points.to(directions)
-            found[rows] = middle + (height - (middle * towards).sum(-1, keepdim=True)) * towards
+            corner, point = corners.to(directions), points.to(directions)
+            for some, part in zip(rows.split(BLOCK), towards.split(BLOCK), strict=True):
+                height = (part @ corner.T).amax(-1, keepdim=True)
+                middle = (part / FLAT @ point.T).softmax(-1) @ point
+                found[some] = middle + (height - (middle * part).sum(-1, keepdim=True)) * part
         return found
 
 

@@ -91,6 +91,25 @@ def test_isaac_keeps_poses_joints_and_names(tmp_path):
         write_grasps(several, tmp_path / "all.yaml", "isaac")
     write_grasps(several, tmp_path / "all", "isaac")
     assert sorted(path.name for path in (tmp_path / "all").iterdir()) == ["box_1.yaml", "mug_0.08.yaml"]
+    back = read_grasps(tmp_path / "all")
+    assert len(back) == len(several)
+    matched(back, several.rows([several.names.index(name) for name in back.names]))
+
+
+def test_a_folder_of_isaac_files_is_of_one_gripper_and_one_set_of_joints(tmp_path):
+    write_grasps(random_set(), tmp_path, "isaac")
+    whole = (tmp_path / "mug_0.08.yaml").read_text()
+    for key, value, words in (
+        ("gripper_frame", "other", "one gripper in all files"),
+        (
+            "grasps",
+            {"odd": {**next(iter(yaml.safe_load(whole)["grasps"].values())), "cspace_position": {"z": 0.0}}},
+            "unknown z",
+        ),
+    ):
+        (tmp_path / "mug_0.08.yaml").write_text(yaml.safe_dump(yaml.safe_load(whole) | {key: value}))
+        with pytest.raises(DexgraspError, match=words):
+            read_grasps(tmp_path)
 
 
 def test_isaac_reads_the_published_example(tmp_path):
@@ -146,12 +165,9 @@ def test_dexgraspnet_samples(shared, tmp_path):
     np.testing.assert_array_equal(pickled.rows(range(100)).grasp.pose, told.grasp.pose)
     for name, place in (("dexgraspbench", "bench"), ("isaac", "isaac")):
         write_grasps(told, tmp_path / place, name)
-        files = [tmp_path / place] if name == "dexgraspbench" else sorted((tmp_path / place).iterdir())
-        back = [read_grasps(file) for file in files]
-        assert sum(map(len, back)) == 100
-        for each in back:
-            rows = told.rows([told.names.index(label) for label in each.names])
-            matched(each, rows)
+        back = read_grasps(tmp_path / place)
+        assert len(back) == 100
+        matched(back, told.rows([told.names.index(label) for label in back.names]))
 
 
 def test_graspit_samples(shared):

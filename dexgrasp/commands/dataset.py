@@ -8,7 +8,6 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from dexgrasp.dataset.store import MANIFEST, Store
 from dexgrasp.errors import DexgraspError
 
 SCHEMA = 1
@@ -83,6 +82,7 @@ def _parser() -> argparse.ArgumentParser:
 def _inspect(options: argparse.Namespace) -> None:
     from dexgrasp.dataset.dataset import Dataset
     from dexgrasp.dataset.inspection import description, figure
+    from dexgrasp.dataset.store import Store
 
     for folder in _stores(options.paths):
         print("\n".join(description(Store.open(folder, complete=False))))
@@ -92,6 +92,7 @@ def _inspect(options: argparse.Namespace) -> None:
 
 def _verify(options: argparse.Namespace) -> int:
     from dexgrasp.dataset.dataset import Dataset
+    from dexgrasp.dataset.store import Store
     from dexgrasp.dataset.verification import checked, rechecked
 
     for folder in _stores(options.paths):
@@ -139,6 +140,7 @@ def _card(options: argparse.Namespace) -> None:
 def _stores(paths: Sequence[Path]) -> Iterator[Path]:
     """Yield the folders of all stores that the paths lead to."""
     from dexgrasp.dataset.dataset import Dataset
+    from dexgrasp.dataset.store import MANIFEST
 
     for path in paths:
         folder = path.parent if path.name == MANIFEST else path

@@ -112,6 +112,23 @@ class GraspSet:
         return np.flatnonzero(same & (self.scale == scale))
 
 
+def joined(sets: Sequence[GraspSet]) -> GraspSet:
+    """Return grasps of one hand, joints in the same order, as one set; what one of the sets does not tell is left."""
+    changed: dict[str, Any] = {}
+    for each in fields(GraspSet):
+        values = [getattr(one, each.name) for one in sets]
+        if any(value is None for value in values):
+            changed[each.name] = None
+        elif isinstance(values[0], Posture):
+            poses, joints = [value.pose for value in values], [value.joints for value in values]
+            changed[each.name] = Posture(np.concatenate(poses), np.concatenate(joints))
+        elif isinstance(values[0], np.ndarray):
+            changed[each.name] = np.concatenate(values)
+        elif each.name in ("objects", "names"):
+            changed[each.name] = tuple(name for value in values for name in value)
+    return replace(sets[0], **changed)
+
+
 def posed(position: Float[Array, "N 3"], rotation: Float[Array, "N 3 3"]) -> Float[Array, "N 4 4"]:
     """Join positions (m) and rotations into homogeneous matrices."""
     pose = np.tile(np.eye(4), (len(position), 1, 1))

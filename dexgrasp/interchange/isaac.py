@@ -1,5 +1,6 @@
 """NVIDIA's isaac_grasp YAML, version 1.0: one gripper, one object; metres, radians, quaternions {w, xyz}."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import yaml
 
 from dexgrasp.errors import DexgraspError
 from dexgrasp.interchange.format import Format, Told
-from dexgrasp.interchange.grasp_set import GraspSet, Posture, posed, quaternions, wxyz
+from dexgrasp.interchange.grasp_set import GraspSet, Posture, joined, posed, quaternions, wxyz
 from dexgrasp.sensing.limits import GRASPS, head, sized
 from dexgrasp.sensing.plain_yaml import read_yaml
 
@@ -17,17 +18,28 @@ PREGRASP = "pregrasp_cspace_position"
 
 
 class Isaac(Format):
-    """Reads and writes."""
+    """Reads and writes a file, or a folder of files of one gripper."""
 
     name = "isaac"
-    summary = "Isaac grasp YAML 1.0: position, orientation, cspace_position of one gripper and object"
+    summary = "Isaac grasp YAML 1.0: position, orientation, cspace_position of one gripper and object, or a folder"
 
     def recognises(self, path: Path) -> bool:
-        """By its first key."""
-        return path.is_file() and path.suffix in (".yaml", ".yml") and b"isaac_grasp" in head(path, 4096)
+        """By its first key; one file is enough of a folder."""
+        return bool(_files(path))
 
     def read(self, path: Path, told: Told) -> GraspSet:
-        """Joints are those of `cspace_position`, the same in every grasp, or those told."""
+        """Joints are those of `cspace_position`, the same in every grasp of all files, or those told."""
+        files = _files(path) if path.is_dir() else [path]
+        if not files:
+            raise DexgraspError(f"files of isaac_grasp in {path}", "none", "check the path")
+        first = self._read(files[0], told)
+        same = replace(told, joints=first.joint_names)
+        read = [first, *(self._read(file, same) for file in files[1:])]
+        if len(grippers := {each.hand for each in read}) > 1:
+            raise DexgraspError(f"one gripper in all files of {path}", ", ".join(sorted(grippers)), "read them apart")
+        return joined(read)
+
+    def _read(self, path: Path, told: Told) -> GraspSet:
         try:
             content = read_yaml(sized(path, GRASPS).read_text())
         except (OSError, ValueError, RecursionError, OverflowError, yaml.YAMLError) as error:
@@ -103,6 +115,12 @@ class Isaac(Format):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(yaml.safe_dump(content | {"grasps": told}, sort_keys=False, default_flow_style=None))
         return path
+
+
+def _files(path: Path) -> list[Path]:
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    files = [file for file in files if file.is_file() and file.suffix in (".yaml", ".yml")]
+    return [file for file in files if b"isaac_grasp" in head(file, 4096)]
 
 
 def _frame(content: dict[str, Any], what: str) -> str:
