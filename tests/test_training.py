@@ -103,9 +103,10 @@ def test_bfloat16_is_used_and_close(samples, tmp_path):
     assert sum(rounded.validation.values()) == pytest.approx(sum(exact.validation.values()), rel=0.05)
 
 
-def test_same_result_whatever_the_number_of_processes(samples, tmp_path):
-    one, _ = run(samples, tmp_path / "one", processes=1)
-    two, summary = run(samples, tmp_path / "two", processes=2)
+@pytest.mark.parametrize("turn", [0.0, 0.5])
+def test_same_result_whatever_the_number_of_processes(samples, tmp_path, turn):
+    one, _ = run(samples, tmp_path / "one", processes=1, turn=turn)
+    two, summary = run(samples, tmp_path / "two", processes=2, turn=turn)
     assert summary.processes == 2
     same(one, two)
 

@@ -32,6 +32,7 @@ from dexgrasp.model import GraspNet
 from dexgrasp.progress import track
 from dexgrasp.seeds import stream
 from dexgrasp.training import state
+from dexgrasp.training.augmentation import turned, turns
 from dexgrasp.training.calibration import calibrate, validate
 from dexgrasp.training.feed import Feed
 from dexgrasp.training.log import Log
@@ -149,7 +150,10 @@ def _run(
             group["lr"] = settings.learning_rate * schedule(done, settings)
         optimizer.zero_grad(set_to_none=False)
         terms: dict[str, Tensor] = {}
-        for batch in islice(batches, len(mine)):
+        for shard, batch in zip(mine, islice(batches, len(mine)), strict=True):
+            if settings.turn:
+                angles = turns(batch, settings.turn, seed, done, shard)
+                batch = turned(batch, model.representation, angles)
             for name, value in _backward(model, batch, settings).items():
                 terms[name] = terms.get(name, torch.zeros((), device=device)) + value / settings.shards
         halted = _reduce(model, terms, bool(stop.is_set()), world, device)

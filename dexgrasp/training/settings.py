@@ -18,6 +18,7 @@ class TrainerSettings:
     device: str = "auto"
     precision: str = "float32"
     resident: bool | None = None
+    turn: float = 0.0
     optimizer: str = "adam"
     learning_rate: float = 0.004
     weight_decay: float = 0.0
@@ -36,6 +37,8 @@ class TrainerSettings:
                 raise DexgraspError(f"trainer.{name} of at least 1", str(getattr(self, name)), f"set trainer.{name}")
         if self.processes is not None and self.processes < 1:
             raise DexgraspError("trainer.processes of at least 1", str(self.processes), "null takes all cores or GPUs")
+        if not 0 <= self.turn <= math.pi:
+            raise DexgraspError("trainer.turn of 0 to pi, rad", str(self.turn), "0 turns no view")
         if self.batch % self.shards:
             raise DexgraspError(
                 "trainer.batch to be a multiple of trainer.shards", f"{self.batch} and {self.shards}", "change one"
