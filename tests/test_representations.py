@@ -85,6 +85,8 @@ def test_supports_touch_the_planes_that_hold_the_fingertips(hand):
     torch.testing.assert_close((found * directions).sum(1), heights)
     assert corners[:, :2].norm(dim=1).max() <= 1.02 * REACH * hand.fingers[0].tip_radius
     assert torch.cdist(found, surface.tips[0][1]).amin(1).median() < 0.001
+    compiled = surface.support(torch.zeros(300, dtype=torch.long), directions.float())
+    torch.testing.assert_close(compiled.double(), found, atol=1e-7, rtol=0)
 
 
 def test_a_ball_is_its_own_support():
