@@ -84,7 +84,7 @@ def stages(model: GraspNet, points: np.ndarray) -> dict[str, float]:
     if judge is not None:
         answers = len(told) // len(rows)
         near = surroundings(model.hand, told, level[seeds[:COARSE]])
-        score = judge(rows.repeat(answers, 1), level[chosen].repeat(answers, 1), told, near)
+        score = judge(rows, level[chosen].repeat(answers, 1), told, near)
         told = told.replace(quality=score.sigmoid())
         lap("scorer")
     grasps = told.moved(inverse(level_T_camera))

@@ -16,29 +16,73 @@ CERTAIN = 100.0
 """Logit of the true class in `as_prediction`: its probability is 1 in float32."""
 
 
+Step = nn.Module | tuple[Tensor, Tensor]
+"""A layer, or weight and bias of a linear one."""
+
+
 class Layers(nn.Sequential):
     """Layers in a row. In evaluation on a CPU, a linear layer and the batch norm behind it are one multiplication."""
 
-    def forward(self, rows: Float[Tensor, "N C"]) -> Float[Tensor, "N D"]:
-        apart = self.training or rows.device.type != "cpu"  # a GPU's time goes by the number of launches
-        return super().forward(rows) if apart else next(self.in_pieces([rows]))
+    def forward(self, *parts: Float[Tensor, "_ _"]) -> Float[Tensor, "N D"]:
+        """Return (N, D) for columns of the input in parts; what has fewer rows than N stands for its repetition.
 
-    def in_pieces(self, parts: Iterable[Tensor]) -> Iterator[Tensor]:
+        All its rows, then all once more, ...; in evaluation on a CPU they are multiplied but once.
+        """
+        if self.training or parts[0].device.type != "cpu":  # a GPU's time goes by the number of launches
+            return super().forward(beside(parts))
+        if len({part.shape[0] for part in parts}) == 1 or torch.compiler.is_compiling():
+            return next(self.in_pieces([beside(parts)]))
+        first, *rest = self._steps()
+        assert isinstance(first, tuple)
+        return _run(rest, _linear(first, parts))
+
+    def in_pieces(self, pieces: Iterable[Tensor]) -> Iterator[Tensor]:
         """Yield what evaluation makes of each of some (N, C) rows: (N, D). The weights are joined but once."""
-        steps: list[nn.Module | tuple[Tensor, Tensor]] = []
+        steps = self._steps()
+        for rows in pieces:
+            yield _run(steps, rows)
+
+    def _steps(self) -> list[Step]:
+        steps: list[Step] = []
         for layer, following in zip(self, [*list(self)[1:], None], strict=False):
             if isinstance(layer, nn.Linear):
                 joined = folded(layer, following) if isinstance(following, nn.BatchNorm1d) else None
                 steps.append(joined or (layer.weight, layer.bias))
             elif not isinstance(layer, nn.BatchNorm1d):
                 steps.append(layer)
-        for rows in parts:
-            for step in steps:
-                if isinstance(step, tuple):
-                    rows = F.linear(rows, *step)
-                else:  # behind a linear layer: its own memory
-                    rows = F.relu_(rows) if isinstance(step, nn.ReLU) else step(rows)
-            yield rows
+        return steps
+
+
+def beside(parts: Sequence[Float[Tensor, "_ _"]]) -> Float[Tensor, "N C"]:
+    """Join columns; what has fewer rows than others is repeated as a whole."""
+    if len(parts) == 1:
+        return parts[0]
+    most = max(part.shape[0] for part in parts)
+    return torch.cat([part if part.shape[0] == most else part.repeat(most // len(part), 1) for part in parts], dim=1)
+
+
+def _run(steps: Iterable[Step], rows: Tensor) -> Tensor:
+    for step in steps:
+        if isinstance(step, tuple):
+            rows = F.linear(rows, *step)
+        else:  # behind a linear layer: its own memory
+            rows = F.relu_(rows) if isinstance(step, nn.ReLU) else step(rows)
+    return rows
+
+
+def _linear(layer: tuple[Tensor, Tensor], parts: Sequence[Float[Tensor, "_ _"]]) -> Float[Tensor, "N D"]:
+    """Return the product of `beside(parts)`; parts of fewer rows are multiplied once and added to each repetition."""
+    columns, bias = layer[0].split([part.shape[1] for part in parts], dim=1), layer[1]
+    total = None
+    for count in sorted({len(part) for part in parts}):
+        some = [k for k, part in enumerate(parts) if len(part) == count]
+        weight, rows = (torch.cat([each[k] for k in some], dim=1) for each in (columns, parts))
+        if total is None:
+            total = F.linear(rows, weight, bias)
+        else:
+            total = (F.linear(rows, weight).unflatten(0, (-1, len(total))) + total).flatten(0, 1)
+    assert total is not None
+    return total
 
 
 def folded(layer: nn.Linear, norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
@@ -67,10 +111,10 @@ class Heads(nn.Module):
         outputs = list(self.sizes.values()) if separate else [sum(self.sizes.values())]
         self.layers = nn.ModuleList(mlp(channels, hidden, out) for out in outputs if out > 0)
 
-    def forward(self, features: Float[Tensor, "N C"]) -> dict[str, Tensor]:
-        """Return (N, size) per name."""
-        nothing = features[:, :0]
-        joined = torch.cat([nothing, *(layer(features) for layer in self.layers)], dim=-1)
+    def forward(self, *features: Float[Tensor, "_ _"]) -> dict[str, Tensor]:
+        """Return (N, size) per name; for `features` in parts see `Layers.forward`."""
+        nothing = max(features, key=len)[:, :0] if len(features) > 1 else features[0][:, :0]
+        joined = torch.cat([nothing, *(layer(*features) for layer in self.layers)], dim=-1)
         return dict(zip(self.sizes, joined.split(list(self.sizes.values()), dim=-1), strict=True))
 
 

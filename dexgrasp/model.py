@@ -148,7 +148,7 @@ class GraspNet(nn.Module):
         if coarse is None and self.backbone.farthest_first and len(every) >= min(COARSE, len(cloud)):
             coarse = every[:COARSE]
         spread = coarse_points(cloud) if coarse is None else cloud[coarse]
-        features, at = features.repeat(answers, 1), cloud[seeds].repeat(answers, 1)
+        at = cloud[seeds].repeat(answers, 1)
         return grasps.replace(quality=scorer(features, at, grasps, surroundings(self.hand, grasps, spread)).sigmoid())
 
     def predict(

@@ -60,12 +60,15 @@ class Scorer(nn.Module):
 
     def forward(
         self,
-        features: Float[Tensor, "N C"],
+        features: Float[Tensor, "M C"],
         at: Float[Tensor, "N 6"],
         grasps: Grasps,
         around: Float[Tensor, "N K 7"],
     ) -> Float[Tensor, "N"]:
-        """Return N logits; `at` is point (m) and normal where each grasp is told, level frame; `around` see below."""
+        """Return N logits; `at` is point (m) and normal where each grasp is told, level frame; `around` see below.
+
+        Features of M points, of each of which N / M answers are judged: all points' first, all points' second, ...
+        """
         offset = (grasps.pose[:, :3, 3] - at[:, :3]) / REACH
         turned = grasps.pose[:, :3, :2].flatten(1)
         each, rows = around.shape[1], around.to(features).flatten(0, 1)
@@ -74,8 +77,9 @@ class Scorer(nn.Module):
         else:
             pieces = self.around.in_pieces(rows.split(PIECE * each))  # that stay in the cache
             near = torch.cat([piece.unflatten(0, (-1, each)).amax(dim=1) for piece in pieces])
-        seen = [features, near, offset, turned, at[:, 3:], at[:, 2:3] / REACH, grasps.joints]
-        return self.layers(torch.cat([part.to(features) for part in seen], dim=1)).squeeze(1)
+        seen = [near, offset, turned, at[:, 3:], at[:, 2:3] / REACH, grasps.joints]
+        own = torch.cat([part.to(features) for part in seen], dim=1)
+        return self.layers(features, own).squeeze(1)
 
     @torch.no_grad()
     def calibrate(self, logits: Float[Tensor, "N"], came: Float[Tensor, "N"]) -> None:

@@ -264,17 +264,16 @@ class StagedContact(Representation):
             seen = [features, *(known if self.conditioned else [])]
             if name == "supporting":
                 seen = [*seen, *raw.values()] if self.refine else [features]
-            raw |= self.stages[name](torch.cat(seen, dim=-1))
+            raw |= self.stages[name](*seen)
             shapes = {"projection": (len(self.anchors), 1 + self.told), "touching": (self.fingers,)}
             shape = shapes[name] if name in shapes else (len(self.slots[name]), 2, self.joints.most)
             shaped[name] = raw[name].unflatten(-1, (self.versions, *shape))
-            if name == "projection":
+            if name == "projection":  # what is known by now is the same for all choices, and stays as it is
                 every = [_without_likeliest(shaped[name], choice) if choice else shaped[name] for choice in choices]
                 shaped[name] = torch.cat(every)
-                if len(every) > 1:
-                    features, finger = features.repeat(len(every), 1), finger.repeat(len(every))
-                    known = [part.repeat(len(every), 1) for part in known]
-                    raw = {head: value.repeat(len(every), 1) for head, value in raw.items()}
+                finger = finger.repeat(len(every)) if len(every) > 1 else finger
+            elif len(choices) > 1 and len(shaped[name]) < len(finger):  # a head that sees nothing of the choice
+                shaped[name] = shaped[name].repeat(len(choices), *[1] * (shaped[name].dim() - 1))
             if self.conditioned and name != "supporting":
                 known.append(self._decided(name, shaped[name], finger, truth))
         position = [(self.first_slots + self.second_slots).index(slot) for slot in self.main_slots]

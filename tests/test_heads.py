@@ -9,6 +9,7 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.heads import (
     Heads,
     JointBins,
+    beside,
     contact_points,
     every_finger,
     finger_loss,
@@ -194,3 +195,18 @@ def test_the_touching_finger_picks_its_own_outputs():
     torch.testing.assert_close(picked["b"], once[:, 0])
     again = of_finger(every_finger(picked, 3), finger)
     assert all(torch.equal(again[name], picked[name]) for name in picked)
+
+
+def test_parts_of_fewer_rows_stand_for_their_repetition():
+    layers = mlp(7, [16, 8], 3)
+    for layer in layers:
+        if isinstance(layer, torch.nn.BatchNorm1d):
+            layer.running_mean, layer.running_var = (
+                torch.randn(layer.num_features),
+                torch.rand(layer.num_features) + 0.5,
+            )
+    few, many, more = torch.randn(5, 2), torch.randn(15, 4), torch.randn(5, 1)
+    whole = torch.cat([few.repeat(3, 1), many, more.repeat(3, 1)], dim=1)
+    torch.testing.assert_close(beside([few, many, more]), whole)
+    assert torch.equal(layers.train()(few, many, more), layers(whole))
+    torch.testing.assert_close(layers.eval()(few, many, more), layers(whole))

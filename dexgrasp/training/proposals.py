@@ -94,7 +94,7 @@ def _of_view(
     if own:
         at, around = cloud[seeds].repeat(len(told), 1), surroundings(hand, grasps, coarse[:COARSE])
         assert model.scorer is not None
-        score = model.scorer(features.repeat(len(told), 1), at, grasps, around)
+        score = model.scorer(features, at, grasps, around)
         rows = _best(model, grasps.replace(quality=score.sigmoid()), coarse, settings)
     else:
         order = torch.from_numpy(stream(seed, "proposals", index).permutation(len(grasps)))
