@@ -43,7 +43,7 @@ class Scorer(nn.Module):
         hand: Hand,
         channels: int,
         choices: int = 1,
-        most: int = 256,
+        most: int = 640,
         hidden: Sequence[int] = (256, 128),
         around: Sequence[int] = (32, 64),
     ) -> None:

@@ -127,7 +127,7 @@ def test_it_tries_what_it_would_choose_itself(tmp_path, monkeypatch, tiny):
         monkeypatch.setattr(where, "free", lambda hand, shape, grasps, *_: torch.ones(len(grasps), dtype=torch.bool))
     dataset, model = tiny[1], network(2048)
     save_model(path := tmp_path / "model.safetensors", model)
-    told = ScorerSettings(choices=2, most=200, taught=200, per_view=60, epochs=1, batch=32, chosen=1)
+    told = ScorerSettings(choices=2, most=200, per_view=60, epochs=1, batch=32, chosen=1)
     once = scoring.fit_scorer(model, path, dataset, told, 0, 1)
     save_model(path, model)
     views = dataset.split("train")[:3]

@@ -87,8 +87,7 @@ def _of_view(
     model, hand = _network(path, stamp), dataset.hand
     view = levelled(dataset.view(index))
     cloud = torch.cat([view.points, view.normals], dim=1)
-    most = settings.most if own else settings.taught
-    features, seeds, told = model.told(cloud, choices=settings.choices, most=most)
+    features, seeds, told = model.told(cloud, choices=settings.choices, most=settings.most)
     grasps = Grasps.cat(told).replace(object=view.instance[seeds].repeat(len(told)))
     coarse = coarse_points(cloud, SPREAD)
     if own:

@@ -10,9 +10,8 @@ from dexgrasp.simulation.protocol import load_protocol
 class ScorerSettings:
     """`conf/scorer`; see there for what each value does."""
 
-    choices: int = 3
-    most: int = 256
-    taught: int = 640
+    choices: int = 1
+    most: int = 640
     hidden: tuple[int, ...] = (256, 128)
     around: tuple[int, ...] = (32, 64)
     per_view: int = 200
@@ -31,7 +30,7 @@ class ScorerSettings:
     blocked: tuple[float, ...] = (0.21, 0.27, 0.40, 0.63, 0.71, 0.72, 0.77)
 
     def __post_init__(self) -> None:
-        for name in ("choices", "most", "taught", "per_view", "rounds", "chosen", "epochs", "batch"):
+        for name in ("choices", "most", "per_view", "rounds", "chosen", "epochs", "batch"):
             if getattr(self, name) < 1:
                 raise DexgraspError(f"scorer.{name} of at least 1", str(getattr(self, name)), f"set scorer.{name}")
         if self.verdicts < 0 or self.weight <= 0:
