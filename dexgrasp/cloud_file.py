@@ -64,6 +64,8 @@ def read_cloud(path: str | Path, scale: float | None = None, intrinsics: Intrins
     """
     path = Path(path).expanduser()
     kind = path.suffix.lower()
+    if not path.exists():
+        raise DexgraspError(f"a cloud or depth image: {', '.join(KINDS)}", f"no file {path}", "check the path")
     if kind not in KINDS:
         raise DexgraspError(f"a cloud or depth image: {', '.join(KINDS)}", str(path), "convert the file")
     content = sized(path).read_bytes()

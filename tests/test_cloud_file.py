@@ -97,3 +97,9 @@ def test_public_scenes_are_read(shared):
     cloud, image = (read_cloud(scenes / f"mosd_kinect/test31.{kind}") for kind in ("pcd", "npz"))
     assert cloud.shape == image.shape == (480, 640) and np.array_equal(cloud.rows, image.rows)
     np.testing.assert_allclose(cloud.points, image.points, atol=2e-4)
+
+
+@pytest.mark.parametrize("name", ["gone", "gone.ply"])
+def test_a_file_that_is_not_there_is_said_to_be_missing(tmp_path, name):
+    with pytest.raises(DexgraspError, match=f"no file .*{name}"):
+        read_cloud(tmp_path / name)
