@@ -43,6 +43,8 @@ def data(name: str, path: str) -> str:
 # At import, so that it is there in every worker process that unpickles a task or a config.
 OmegaConf.register_new_resolver("package", package, replace=True)
 OmegaConf.register_new_resolver("data", data, replace=True)
+# Hydra writes what it was told into a run's folder; the words that resume a run must not take the place of the first.
+OmegaConf.register_new_resolver("notes", lambda resume: ".hydra" if resume is None else ".hydra/resumed", replace=True)
 OmegaConf.register_new_resolver("usage", usage.text, replace=True)
 OmegaConf.register_new_resolver("first", lambda *values: next((v for v in values if v is not None), None), replace=True)
 

@@ -101,8 +101,10 @@ def test_a_killed_training_goes_on_to_the_same_weights(made: Path, tiny_job: lis
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
     assert not (folder / "model.safetensors").exists()
+    words = (folder / ".hydra" / "overrides.yaml").read_text()
     status, _, err = run(home, "train", f"resume={folder}")
     assert status == 0, err
+    assert (folder / ".hydra" / "overrides.yaml").read_text() == words, "what the run was told, not what resumed it"
     assert (folder / "model.safetensors").read_bytes() == (made / "model.safetensors").read_bytes()
     assert (folder / "metrics.csv").read_text() == (made / "metrics.csv").read_text()
     shutil.rmtree(folder)
