@@ -30,7 +30,8 @@ class Layers(nn.Sequential):
         """
         if self.training or parts[0].device.type != "cpu":  # a GPU's time goes by the number of launches
             return super().forward(beside(parts))
-        if len({part.shape[0] for part in parts}) == 1 or torch.compiler.is_compiling():
+        # An exported network has rows of any number, which can't be told apart.
+        if torch.compiler.is_compiling() or len({part.shape[0] for part in parts}) == 1:
             return next(self.in_pieces([beside(parts)]))
         first, *rest = self._steps()
         assert isinstance(first, tuple)
@@ -57,8 +58,8 @@ def beside(parts: Sequence[Float[Tensor, "_ _"]]) -> Float[Tensor, "N C"]:
     """Join columns; what has fewer rows than others is repeated as a whole."""
     if len(parts) == 1:
         return parts[0]
-    most = max(part.shape[0] for part in parts)
-    return torch.cat([part if part.shape[0] == most else part.repeat(most // len(part), 1) for part in parts], dim=1)
+    rows = max(part.shape[0] for part in parts)
+    return torch.cat([part if (own := part.shape[0]) == rows else part.repeat(rows // own, 1) for part in parts], dim=1)
 
 
 def _run(steps: Iterable[Step], rows: Tensor) -> Tensor:
