@@ -98,7 +98,7 @@ def mlp(channels: int, hidden: Sequence[int], out: int) -> Layers:
     """Return linear, batch norm, ReLU per hidden layer and a linear layer on top (no bias under a batch norm)."""
     layers: list[nn.Module] = []
     for width in hidden:
-        layers += [nn.Linear(channels, width, bias=False), nn.BatchNorm1d(width), nn.ReLU()]
+        layers += [nn.Linear(channels, width, bias=False), nn.BatchNorm1d(width), nn.ReLU(inplace=True)]
         channels = width
     return Layers(*layers, nn.Linear(channels, out))
 

@@ -232,7 +232,7 @@ class StagedContact(Representation):
             return outputs | self._tell(features, outputs["finger"], truth)
         told = self._tell(features.index_select(0, rows), outputs["finger"].index_select(0, rows), truth[rows])
         return outputs | {
-            name: value.new_zeros(len(features), *value.shape[1:]).index_copy(0, rows, value)
+            name: value.new_zeros(len(features), *value.shape[1:]).index_copy_(0, rows, value)
             for name, value in told.items()
         }
 

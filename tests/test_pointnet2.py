@@ -3,7 +3,8 @@
 import pytest
 import torch
 from dexgrasp_pointnet2 import PointNet2
-from dexgrasp_pointnet2.layers import FeaturePropagation, SetAbstraction
+from dexgrasp_pointnet2.interpolation import interpolated, interpolated_reference
+from dexgrasp_pointnet2.layers import FeaturePropagation, FewColumns, SetAbstraction
 from dexgrasp_pointnet2.pooling import ball_max, ball_max_reference
 
 from dexgrasp.errors import DexgraspError
@@ -169,3 +170,24 @@ def test_cuda_gives_what_the_cpu_gives(factorised):
     torch.testing.assert_close(there.cpu(), features, atol=1e-4, rtol=1e-3)
     for parameter, expected in zip(net.parameters(), gradients, strict=True):
         torch.testing.assert_close(parameter.grad.cpu(), expected, atol=1e-4, rtol=1e-2)
+
+
+@pytest.mark.parametrize("integer", [torch.int32, torch.int64])
+def test_compiled_interpolation_is_the_reference(integer):
+    rows = torch.randn(40, 7, requires_grad=True)
+    nearest, shares, weight = torch.randint(0, 40, (300, 3)), torch.rand(300, 3), torch.randn(300, 7)
+    expected = interpolated_reference(rows, nearest, shares)
+    told = interpolated(rows, nearest.to(integer), shares.to(rows))
+    torch.testing.assert_close(told, expected)
+    (gradient,) = torch.autograd.grad((told * weight).sum(), rows)
+    torch.testing.assert_close(gradient, torch.autograd.grad((expected * weight).sum(), rows)[0])
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_few_columns_are_a_linear_layer(training):
+    layer = FewColumns(3, 9).train(training)
+    rows, weight = torch.randn(50, 3), torch.randn(50, 9)
+    expected = torch.nn.functional.linear(rows, layer.weight)
+    torch.testing.assert_close(layer(rows), expected)
+    (gradient,) = torch.autograd.grad((layer(rows) * weight).sum(), layer.weight)
+    torch.testing.assert_close(gradient, torch.autograd.grad((expected * weight).sum(), layer.weight)[0])
