@@ -66,8 +66,9 @@ def ship(
     if size + others > LIMIT:
         told = f"{size / 1e6:.1f} MB beside {others / 1e6:.1f} MB"
         raise DexgraspError(f"at most {LIMIT / 1e6:.0f} MB of shipped weights", told, "half=true, or ship fewer")
+    source = commit()  # before what is written counts as a change
     write_tensors(target, tensors, {key: value for key, value in notes.items() if key != "format"})
-    lines = _card(name, target, path.parent, model, notes, found, results)
+    lines = _card(name, target, path.parent, model, notes, found, results, source)
     card = target.with_suffix(".md")
     replace_file(card, ("\n".join(lines) + "\n").encode())
     return card
@@ -108,6 +109,7 @@ def _card(
     notes: Mapping[str, Any],
     half: Difference | None,
     results: Sequence[Path],
+    source: str,
 ) -> Iterator[str]:
     config = OmegaConf.load(run / "config.yaml") if (run / "config.yaml").is_file() else None
     own = _json(run / "results.json") if (run / "results.json").is_file() else {}
@@ -127,7 +129,7 @@ def _card(
             f"{half.rows:,} grasps stay within {MOVED:g} m, rad and of their score."
         )
     yield from ("", "## How it was made", "")
-    yield f"- dexgrasp {dexgrasp.__version__}, shipped from commit {commit()}; torch {torch.__version__}"
+    yield f"- dexgrasp {dexgrasp.__version__}, shipped from commit {source}; torch {torch.__version__}"
     facts = notes.get("facts", {})
     yield f"- seed {facts.get('seed', 'not known')}, {facts.get('steps', 'an unknown number of')} steps"
     overrides = run / ".hydra" / "overrides.yaml"
