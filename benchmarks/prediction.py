@@ -107,6 +107,11 @@ def plain_normals(points: Tensor, *_: object, k: int, at: np.ndarray, **__: obje
     return torch.cat(found)
 
 
+def plain_layers(layers: heads.Layers, *parts: Tensor) -> Tensor:
+    """Return what `Layers` does, layer by layer, on all columns of all rows."""
+    return torch.nn.Sequential.forward(layers, heads.beside(parts))
+
+
 @contextmanager
 def plain() -> Iterator[None]:
     """Take the plain torch form of whatever has one."""
@@ -122,7 +127,7 @@ def plain() -> Iterator[None]:
             (network, "neighbours", sampling.neighbours_reference),
             (layers, "ball_max", ball_max_reference),
             (scorer, "_compiled", scorer.around_reference),
-            (heads.Layers, "forward", torch.nn.Sequential.forward),
+            (heads.Layers, "forward", plain_layers),
         ):
             stack.enter_context(patch.object(place, name, instead))
         yield

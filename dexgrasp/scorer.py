@@ -42,8 +42,8 @@ class Scorer(nn.Module):
         self,
         hand: Hand,
         channels: int,
-        choices: int = 1,
-        most: int = 640,
+        choices: int = 3,
+        most: int = 256,
         hidden: Sequence[int] = (256, 128),
         around: Sequence[int] = (32, 64),
     ) -> None:

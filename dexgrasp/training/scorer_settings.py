@@ -10,8 +10,8 @@ from dexgrasp.simulation.protocol import load_protocol
 class ScorerSettings:
     """`conf/scorer`; see there for what each value does."""
 
-    choices: int = 1
-    most: int = 640
+    choices: int = 3
+    most: int = 256
     hidden: tuple[int, ...] = (256, 128)
     around: tuple[int, ...] = (32, 64)
     per_view: int = 200
