@@ -166,45 +166,55 @@ def procedural(
     seed: int = 0,
     size: tuple[float, float] = (1.0, 1.0),
     stretch: float = 1.0,
+    thickness: tuple[float, float] | None = None,
+    suffix: str = "",
 ) -> ObjectSet:
     """Return embedded shapes; `count` null gives the split's default number. Same arguments, same shapes.
 
     A shape follows from the seed, its family and its number alone. The test split holds other draws of every
-    training family, and families that training never sees. `size` and `stretch` as in `shape`.
+    training family, and families that training never sees. `size`, `stretch`, `thickness` and `suffix` as in `shape`.
     """
     from dexgrasp.shapes import FAMILIES, HELD_OUT  # reading objects needs no solid modeller
 
     if split not in SPLITS:
         raise DexgraspError(f"objects.split to be one of {SPLITS}", repr(split), "set objects.split")
     if split == "all":
-        halves = [procedural(half, count, seed, size, stretch) for half in ("train", "test")]
+        halves = [procedural(half, count, seed, size, stretch, thickness, suffix) for half in ("train", "test")]
         return ObjectSet(f"procedural-all-{seed}", (*halves[0], *halves[1]))
     families = FAMILIES if split == "train" else HELD_OUT | FAMILIES
     count = (3 * len(FAMILIES) if split == "train" else len(families)) if count is None else count
     start = 0 if split == "train" else FIRST_TEST_NUMBER
     names = list(families)
     drawn = [(names[i % len(names)], start + i // len(names)) for i in range(count)]
-    objects = tuple(shape(family, number, seed, size, stretch) for family, number in drawn)
+    objects = tuple(shape(family, number, seed, size, stretch, thickness, suffix) for family, number in drawn)
     return ObjectSet(f"procedural-{split}-{seed}", objects)
 
 
 def shape(
-    family: str, number: int, seed: int = 0, size: tuple[float, float] = (1.0, 1.0), stretch: float = 1.0
+    family: str,
+    number: int,
+    seed: int = 0,
+    size: tuple[float, float] = (1.0, 1.0),
+    stretch: float = 1.0,
+    thickness: tuple[float, float] | None = None,
+    suffix: str = "",
 ) -> Object:
     """Return one procedural shape, its centre of mass at the origin; raises DexgraspError for an unknown family.
 
     Its natural size is multiplied by a factor drawn from the range `size`, and each axis by one drawn from
-    1 / stretch .. stretch (both uniform in the logarithm).
+    1 / stretch .. stretch; with a range `thickness` (m), its shortest side is then brought to a length from there
+    where it is longer (all uniform in the logarithm). `suffix` ends its name.
     """
     from dexgrasp.shapes import FAMILIES, HELD_OUT
 
     makers: dict[str, Family] = FAMILIES | HELD_OUT
     if family not in makers:
         raise DexgraspError("a shape family", repr(family), f"take one of {sorted(makers)}")
-    if not 0 < size[0] <= size[1] or stretch < 1:
+    if not 0 < size[0] <= size[1] or stretch < 1 or not (thickness is None or 0 < thickness[0] <= thickness[1]):
         raise DexgraspError(
-            "objects.size two positive factors in order, objects.stretch at least 1",
-            f"{size}, {stretch}",
+            "objects.size two positive factors in order, objects.stretch at least 1, objects.thickness null or two "
+            "lengths in order",
+            f"{size}, {stretch}, {thickness}",
             "set them so",
         )
     solid = makers[family](stream(seed, "object", family, number))
@@ -212,7 +222,13 @@ def shape(
         draw = stream(seed, "size", family, number)
         whole, axes = draw.uniform(*np.log(size)), draw.uniform(-np.log(stretch), np.log(stretch), 3)
         solid = solid.scaled(np.exp(whole + axes))
-    return _object(solid, f"{family}_{number:03d}", family, f"procedural seed={seed}")
+    if thickness is not None:
+        wanted = np.exp(stream(seed, "thickness", family, number).uniform(*np.log(thickness)))
+        low, high = np.reshape(solid.body.bounding_box(), (2, 3))
+        factors = np.ones(3)
+        factors[np.argmin(high - low)] = min(1.0, wanted / (high - low).min())
+        solid = solid.scaled(factors)
+    return _object(solid, f"{family}_{number:03d}{suffix}", family, f"procedural seed={seed}")
 
 
 def _object(solid: "Solid", name: str, family: str, source: str) -> Object:
