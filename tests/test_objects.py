@@ -85,6 +85,23 @@ def test_sizes_are_drawn_and_repeat() -> None:
         procedural("train", 1, 0, (2.0, 1.0))
 
 
+def test_flat_shapes_have_the_thickness_that_is_drawn() -> None:
+    natural = procedural("train", 12)
+    flat = procedural("train", 12, thickness=(0.012, 0.03), suffix="_flat")
+    assert flat.names == tuple(f"{name}_flat" for name in natural.names)
+    for plain, item in zip(natural, flat, strict=True):
+        assert item.mesh.is_watertight and np.allclose(item.com, 0, atol=1e-6)
+        shortest = plain.mesh.extents.argmin()
+        others = np.arange(3) != shortest
+        assert item.mesh.extents[others] == pytest.approx(plain.mesh.extents[others])
+        assert 0.012 - 1e-9 <= item.mesh.extents[shortest] <= 0.03 + 1e-9
+    assert len(set(flat[k].mesh.extents.min() for k in range(12))) == 12
+    thin = procedural("train", 12, thickness=(1.0, 2.0))  # nothing is made thicker
+    assert all(np.array_equal(a.mesh.vertices, b.mesh.vertices) for a, b in zip(natural, thin, strict=True))
+    with pytest.raises(DexgraspError, match=r"objects\.thickness"):
+        procedural("train", 1, thickness=(0.02, 0.01))
+
+
 def test_several_sets_are_one() -> None:
     one, other = ({"kind": "procedural", "split": split, "count": 2} for split in ("train", "test"))
     both = load_objects({"kind": "several", "sets": {"a": one, "b": other}})
