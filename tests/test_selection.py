@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from dexgrasp.execution import pregrasp
+from dexgrasp.geometry import inverse
 from dexgrasp.grasps import Grasps
-from dexgrasp.selection import Selection, free, select
+from dexgrasp.selection import Selection, free, on_table, select
 
 ALL = Selection(depth=None, table=None, distance=0.0)
 FAR = torch.tensor([[0.0, 0.0, 5.0]])
@@ -45,6 +46,31 @@ def test_free_of_the_table(hand, shape):
     grasps = above(hand, [-lowest + 0.003, -lowest - 0.0005, -lowest - 0.002])
     assert free(hand, shape, grasps, FAR, table, Selection()).tolist() == [True, True, False]
     assert free(hand, shape, grasps, FAR, None, Selection()).all()
+
+
+def test_hands_that_reach_into_the_table_are_raised(hand, shape):
+    table = torch.eye(4).double()
+    table[:3, :3] = torch.linalg.matrix_exp(torch.tensor([[0.0, 0.3, -0.2], [-0.3, 0, 0.5], [0.2, -0.5, 0]]).double())
+    table[:3, 3] = torch.tensor([0.1, -0.2, 0.7])
+    level, postures = above(hand, [0.0]), []
+    for joints in (level.joints, pregrasp(hand, level, 0.0)[1]):
+        postures.append(float(shape.table_distance(level.pose, joints)))
+    offsets = [-0.025, -0.015, -0.001, 0.003, 0.006]
+    grasps = above(hand, [offset - min(postures) for offset in offsets]).moved(inverse(table))
+    selection = Selection()
+    done = on_table(hand, shape, grasps, table, selection)
+    wanted = [0.0, 0.0155, 0.0015, 0.0, 0.0]
+    moved = (done.pose - grasps.pose)[:, :3, 3].double()
+    assert (moved @ table[2, :3]).tolist() == pytest.approx(wanted, abs=1e-5)
+    assert moved.norm(dim=1).tolist() == pytest.approx([abs(value) for value in wanted], abs=1e-5)
+    assert torch.equal(done.pose[:, :3, :3], grasps.pose[:, :3, :3]) and torch.equal(done.joints, grasps.joints)
+    never = on_table(hand, shape, grasps, table, replace(selection, raised=0.0))
+    assert torch.equal(never.pose, grasps.pose)
+    # What reached into the table is offered from above it, and nobody's grasps are changed.
+    before, cloud = grasps.pose.clone(), torch.cat([FAR, torch.tensor([[0.0, 0, -1]])], dim=1)
+    offered = select(hand, grasps[1:2], cloud, 1, replace(selection, depth=None), table)
+    assert torch.allclose(offered.pose, done.pose[1:2]) and torch.equal(grasps.pose, before)
+    assert len(select(hand, grasps[:1], cloud, 1, replace(selection, depth=None), table)) == 0
 
 
 def test_select_sorts_limits_and_drops(hand):

@@ -22,7 +22,7 @@ from dexgrasp.progress import track
 from dexgrasp.scene import View
 from dexgrasp.scorer import COARSE, coarse_points, surroundings
 from dexgrasp.seeds import stream
-from dexgrasp.selection import free, select
+from dexgrasp.selection import free, on_table, select
 from dexgrasp.simulation.protocol import load_protocol
 from dexgrasp.threads import one_thread
 from dexgrasp.training.scorer_settings import ScorerSettings
@@ -31,6 +31,8 @@ DRAWN = 3
 """So many times the grasps wanted of a view are drawn: most meet what the camera sees."""
 SPREAD = 2048
 """Points of a view of which none may lie in the open hand: fewer than in prediction, to save time."""
+LEVEL = torch.eye(4, dtype=torch.float64)
+"""The table in the level frame."""
 
 
 @dataclass(frozen=True)
@@ -99,8 +101,9 @@ def _of_view(
         order = torch.from_numpy(stream(seed, "proposals", index).permutation(len(grasps)))
         rows = _some(model, dataset, grasps, coarse, settings, order)
     grasps, at = grasps[rows], rows % len(seeds)
+    done = on_table(hand, dataset.shape, grasps, LEVEL, model.selection)  # as prediction would have it carried out
     truth = scene_truth(dataset, dataset.scene_of(index), view.world_T_camera.double())
-    found = truth.outcome(grasps)
+    found = truth.outcome(done)
     # 0: one finger or none; else by how many times its weight the object is held.
     kind = 1 + torch.bucketize(found.capacity, torch.tensor(settings.capacity).to(found.capacity), right=True)
     kind[found.touched < 2] = 0
@@ -109,7 +112,7 @@ def _of_view(
     around = surroundings(hand, grasps, coarse[:COARSE]).half()
     lifted = torch.full_like(worth, torch.nan)
     tried = len(grasps) if own else settings.verdicts
-    lifted[:tried] = _executed(dataset, view, grasps[:tried], index, settings.protocol)
+    lifted[:tried] = _executed(dataset, view, done[:tried], index, settings.protocol)
     told_by = features[at], cloud[seeds[at]], grasps.pose, grasps.joints, around, grasps.quality
     return Proposals(*told_by, worth, lifted, holds)
 
@@ -129,18 +132,18 @@ def _some(
     on = grasps.object[order] >= 0
     rows = torch.cat([order[on][: DRAWN * settings.per_view], order[~on][: settings.per_view // 10]])
     # What prediction rules out by itself teaches nothing.
-    table = torch.eye(4, dtype=torch.float64)
-    passed = free(model.hand, dataset.shape, grasps[rows], coarse[:, :3], table, model.selection)
+    done = on_table(model.hand, dataset.shape, grasps[rows], LEVEL, model.selection)
+    passed = free(model.hand, dataset.shape, done, coarse[:, :3], LEVEL, model.selection)
     return rows[passed][: settings.per_view]
 
 
 def _best(model: GraspNet, grasps: Grasps, coarse: Float[Tensor, "Q 6"], settings: ScorerSettings) -> Int[Tensor, "P"]:
     """Return the grasps of each object that would be offered first, as many as are asked for."""
-    table, rows = torch.eye(4, dtype=torch.float64), [torch.zeros(0, dtype=torch.long)]
+    rows = [torch.zeros(0, dtype=torch.long)]
     for number in grasps.object[grasps.object >= 0].unique():
         own = (grasps.object == number).nonzero().flatten()
         known = grasps[own].replace(object=own)  # so that it is known which ones come back
-        rows.append(select(model.hand, known, coarse, settings.chosen, model.selection, table).object)
+        rows.append(select(model.hand, known, coarse, settings.chosen, model.selection, LEVEL).object)
     return torch.cat(rows)
 
 
