@@ -14,6 +14,7 @@ from dexgrasp.execution import pregrasp
 from dexgrasp.geometry import rotation_angle
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
+from dexgrasp.set_up import above, upright
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class Selection:
     infeasible ones at 3 mm (11 % at 10 mm); most of these meet what the camera does not see."""
     table: float | None = 0.001
     """How far the hand may reach below the table that is found in the cloud; None: no table is looked for."""
+    upright: float = 0.5
+    """A hand that comes down on the table this steeply is turned to come straight down; 0: none is."""
     raised: float = 0.02
     """A hand that reaches into the table by less than this is raised until it clears it by `gap`; 0: none is."""
     gap: float = 0.0005
@@ -84,19 +87,9 @@ def select(
 
 
 def on_table(hand: Hand, shape: Any, grasps: Grasps, table: Float[Tensor, "4 4"], selection: Selection) -> Grasps:
-    """Return the grasps, those hands raised to stand upon the table that reach a little into it.
-
-    A network errs by some millimetres, and low things leave no more between sliding off their top and hitting the
-    table. Moved along the table's normal; what a grasp tells of contacts stays. `table` is table_T_camera.
-    """
-    _, joints = pregrasp(hand, grasps, 1.0, selection.opening)
-    motion = table.to(grasps.pose)
-    places, both = (motion @ grasps.pose).repeat(2, 1, 1), torch.cat([grasps.joints, joints])
-    height = torch.as_tensor(shape.table_distance(places, both)).unflatten(0, (2, -1)).amin(dim=0)
-    near = (height > -selection.raised) & (height < 0)
-    pose = grasps.pose.clone()
-    pose[:, :3, 3] += torch.where(near, selection.gap - height, 0.0)[:, None].to(pose) * motion[2, :3]
-    return grasps.replace(pose=pose)
+    """Return the grasps as they are carried out above a table, see `dexgrasp.set_up`; `table` is table_T_camera."""
+    level = upright(hand, grasps, table, selection.upright)
+    return above(hand, shape, level, table, selection.raised, selection.gap, selection.opening)
 
 
 def free(

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dexgrasp.execution import pregrasp
-from dexgrasp.geometry import inverse
+from dexgrasp.geometry import axis_angle, inverse, rotate, rotation_angle
 from dexgrasp.grasps import Grasps
 from dexgrasp.selection import Selection, free, on_table, select
 
@@ -57,7 +57,7 @@ def test_hands_that_reach_into_the_table_are_raised(hand, shape):
         postures.append(float(shape.table_distance(level.pose, joints)))
     offsets = [-0.025, -0.015, -0.001, 0.003, 0.006]
     grasps = above(hand, [offset - min(postures) for offset in offsets]).moved(inverse(table))
-    selection = Selection()
+    selection = Selection(upright=0.0)
     done = on_table(hand, shape, grasps, table, selection)
     wanted = [0.0, 0.0155, 0.0015, 0.0, 0.0]
     moved = (done.pose - grasps.pose)[:, :3, 3].double()
@@ -71,6 +71,27 @@ def test_hands_that_reach_into_the_table_are_raised(hand, shape):
     offered = select(hand, grasps[1:2], cloud, 1, replace(selection, depth=None), table)
     assert torch.allclose(offered.pose, done.pose[1:2]) and torch.equal(grasps.pose, before)
     assert len(select(hand, grasps[:1], cloud, 1, replace(selection, depth=None), table)) == 0
+
+
+def test_hands_that_come_down_steeply_come_straight_down(hand, shape):
+    table = torch.eye(4).double()
+    table[:3, :3] = torch.linalg.matrix_exp(torch.tensor([[0.0, 0.3, -0.2], [-0.3, 0, 0.5], [0.2, -0.5, 0]]).double())
+    grasps = above(hand, [0.3, 0.3, 0.3, 0.3])
+    tilts = torch.tensor([0.0, 0.2, 0.45, 0.6])
+    axes = torch.nn.functional.normalize(torch.tensor([[1.0, 0, 0], [0.3, 0.9, 0], [-1, 1, 0], [0, 1, 0]]), dim=1)
+    grasps.pose[:, :3, :3] = axis_angle(axes, tilts) @ grasps.pose[:, :3, :3]
+    grasps = grasps.moved(inverse(table))
+    done = on_table(hand, shape, grasps, table, Selection())
+    approach = rotate(done.pose.double(), hand.base_T_palm[:3, 2].double().expand(4, 3))
+    angle = torch.acos((-(approach @ table[2, :3])).clamp(-1, 1))
+    assert angle.tolist() == pytest.approx([0.0, 0.0, 0.0, 0.6], abs=1e-3)
+    # No more than it takes, and about the fingertips' middle.
+    assert rotation_angle(done.pose[:, :3, :3], grasps.pose[:, :3, :3]).tolist() == pytest.approx(
+        [0.0, 0.2, 0.45, 0.0], abs=1e-3
+    )
+    middle = [(g.pose[:, None] @ hand.fingertips(g.joints).float())[..., :3, 3].mean(dim=1) for g in (done, grasps)]
+    assert torch.allclose(*middle, atol=1e-5)
+    assert torch.equal(done.pose[3], grasps.pose[3])
 
 
 def test_select_sorts_limits_and_drops(hand):
