@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -176,7 +177,14 @@ class GraspNet(nn.Module):
         level_T_camera = level_frame(cloud, table_T_camera)
         level = carried(cloud, level_T_camera).to(next(self.parameters()).device)
         grasps = self.propose(level).to("cpu").moved(inverse(level_T_camera))
-        return select(self.hand, grasps, cloud, top_k, selection or self.selection, table_T_camera)
+        return select(self.hand, grasps, cloud, top_k, self.selecting(selection), table_T_camera)
+
+    def selecting(self, selection: Selection | None = None) -> Selection:
+        """Return the selection, the model's own where None; what it leaves open is as the scorer was taught."""
+        chosen = selection or self.selection
+        taught = {} if self.scorer is None else self.scorer.options
+        left = {key: taught.get(key, 0.0) for key in ("upright", "raised") if getattr(chosen, key) is None}
+        return replace(chosen, **left)
 
 
 def build_model(config: Mapping[str, Any], points: int = 8192, hand: Hand | None = None) -> GraspNet:

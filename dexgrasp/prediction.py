@@ -81,7 +81,7 @@ def predict_sight(
         raise DexgraspError(
             f"an object from 0 to {sight.objects - 1}", str(target), "see the picture for their numbers"
         )
-    chosen = selection or model.selection
+    chosen = model.selecting(selection)
     cloud = torch.from_numpy(np.hstack([sight.points, sight.normals]))
     table = None if sight.table_T_camera is None else torch.from_numpy(sight.table_T_camera)
     level_T_camera = level_frame(cloud, table)

@@ -36,6 +36,8 @@ class Scorer(nn.Module):
         most: number of points, the most graspable as the heads think, whose grasps it looks at.
         hidden: widths of the hidden layers.
         around: widths of the layers on each point about the hand, whose maximum is then taken (PointNet).
+        upright: what was done to the grasps whose outcome it has learnt, see `dexgrasp.selection.Selection`, rad.
+        raised: likewise, m.
     """
 
     def __init__(
@@ -46,6 +48,8 @@ class Scorer(nn.Module):
         most: int = 256,
         hidden: Sequence[int] = (256, 128),
         around: Sequence[int] = (32, 64),
+        upright: float = 0.0,
+        raised: float = 0.0,
     ) -> None:
         super().__init__()
         self.hand, self.choices, self.most = hand, choices, most
@@ -54,6 +58,8 @@ class Scorer(nn.Module):
             "most": most,
             "hidden": list(hidden),
             "around": list(around),
+            "upright": upright,
+            "raised": raised,
         }
         self.around = mlp(7, around[:-1], around[-1])
         self.layers = mlp(channels + around[-1] + 13 + len(hand.joint_names), hidden, 1)

@@ -32,9 +32,11 @@ class Selection:
     infeasible ones at 3 mm (11 % at 10 mm); most of these meet what the camera does not see."""
     table: float | None = 0.001
     """How far the hand may reach below the table that is found in the cloud; None: no table is looked for."""
-    upright: float = 0.5
-    """A hand that comes down on the table this steeply is turned to come straight down; 0: none is."""
-    raised: float = 0.02
+    upright: float | None = None
+    """A hand that comes down on the table this steeply is turned to come straight down; 0: none is.
+
+    None, here and in the next: as the network's scorer was taught, `GraspNet.selecting`; 0 without one."""
+    raised: float | None = None
     """A hand that reaches into the table by less than this is raised until it clears it by `gap`; 0: none is."""
     gap: float = 0.0005
     retreat: float = 0.10
@@ -88,8 +90,11 @@ def select(
 
 def on_table(hand: Hand, shape: Any, grasps: Grasps, table: Float[Tensor, "4 4"], selection: Selection) -> Grasps:
     """Return the grasps as they are carried out above a table, see `dexgrasp.set_up`; `table` is table_T_camera."""
-    level = upright(hand, grasps, table, selection.upright)
-    return above(hand, shape, level, table, selection.raised, selection.gap, selection.opening)
+    if selection.upright:
+        grasps = upright(hand, grasps, table, selection.upright)
+    if selection.raised:
+        grasps = above(hand, shape, grasps, table, selection.raised, selection.gap, selection.opening)
+    return grasps
 
 
 def free(

@@ -9,13 +9,15 @@ from hydra import compose, initialize_config_dir
 
 from dexgrasp import config as settings
 from dexgrasp import selection
+from dexgrasp.cloud import prepare
 from dexgrasp.errors import DexgraspError
-from dexgrasp.geometry import axis_angle, pose, transform
+from dexgrasp.geometry import axis_angle, pose, rotate, transform
 from dexgrasp.grasps import Grasps
 from dexgrasp.model import GraspNet, build_model, load_model, save_model
 from dexgrasp.scorer import COARSE, NEAREST, Scorer, around_reference, coarse_points, platt, surroundings
 from dexgrasp.selection import Selection
 from dexgrasp.statistics import roc_area
+from dexgrasp.table import find_table
 from dexgrasp.testing.samples import seen
 from dexgrasp.training import proposals, scoring
 from dexgrasp.training.scorer_settings import ScorerSettings
@@ -102,6 +104,27 @@ def test_a_network_with_a_scorer_chooses_from_several_answers(tmp_path):
     save_model(tmp_path / "model.safetensors", model)
     again = load_model(tmp_path / "model.safetensors").predict(points, top_k=500, selection=OPEN)
     assert torch.equal(again.pose, grasps.pose) and torch.equal(again.quality, grasps.quality)
+
+
+def test_grasps_are_set_up_as_the_scorer_was_taught(tmp_path):
+    model, points = network(1024), seen(1500)
+    open_selection = dataclasses.replace(OPEN, table=1.0)  # what reaches into the table stays
+    model.scorer = Scorer(model.hand, model.backbone.channels, choices=1, most=400, upright=1.3, raised=0.02).eval()
+    save_model(tmp_path / "model.safetensors", model)
+    model = load_model(tmp_path / "model.safetensors")
+    assert model.selecting() == dataclasses.replace(model.selection, upright=1.3, raised=0.02)
+    asked = dataclasses.replace(open_selection, upright=0.0)
+    assert model.selecting(asked) == dataclasses.replace(asked, raised=0.02), "what is told counts"
+    table = find_table(prepare(points, None, model.points, 0), 0)
+
+    def straight(grasps: Grasps) -> int:
+        down = rotate(grasps.pose.double(), model.hand.base_T_palm[:3, 2].double().expand(len(grasps), 3))
+        return int((-(down @ table[2, :3].double()) > 1 - 1e-6).sum())
+
+    taught, off = (model.predict(points, top_k=400, selection=each) for each in (open_selection, asked))
+    assert straight(taught) > 0 and straight(off) == 0
+    model.scorer = None
+    assert model.selecting() == dataclasses.replace(model.selection, upright=0.0, raised=0.0)
 
 
 def test_it_learns_from_what_holds_and_leaves_the_network_as_it_is(tmp_path, monkeypatch, tiny):

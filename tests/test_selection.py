@@ -57,7 +57,7 @@ def test_hands_that_reach_into_the_table_are_raised(hand, shape):
         postures.append(float(shape.table_distance(level.pose, joints)))
     offsets = [-0.025, -0.015, -0.001, 0.003, 0.006]
     grasps = above(hand, [offset - min(postures) for offset in offsets]).moved(inverse(table))
-    selection = Selection(upright=0.0)
+    selection = Selection(upright=0.0, raised=0.02)
     done = on_table(hand, shape, grasps, table, selection)
     wanted = [0.0, 0.0155, 0.0015, 0.0, 0.0]
     moved = (done.pose - grasps.pose)[:, :3, 3].double()
@@ -81,7 +81,7 @@ def test_hands_that_come_down_steeply_come_straight_down(hand, shape):
     axes = torch.nn.functional.normalize(torch.tensor([[1.0, 0, 0], [0.3, 0.9, 0], [-1, 1, 0], [0, 1, 0]]), dim=1)
     grasps.pose[:, :3, :3] = axis_angle(axes, tilts) @ grasps.pose[:, :3, :3]
     grasps = grasps.moved(inverse(table))
-    done = on_table(hand, shape, grasps, table, Selection())
+    done = on_table(hand, shape, grasps, table, Selection(upright=0.5))
     approach = rotate(done.pose.double(), hand.base_T_palm[:3, 2].double().expand(4, 3))
     angle = torch.acos((-(approach @ table[2, :3])).clamp(-1, 1))
     assert angle.tolist() == pytest.approx([0.0, 0.0, 0.0, 0.6], abs=1e-3)

@@ -1,7 +1,7 @@
 """Grasps that a network proposes in a dataset's views, judged on the true objects and in part tried in physics."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from dexgrasp.progress import track
 from dexgrasp.scene import View
 from dexgrasp.scorer import COARSE, coarse_points, surroundings
 from dexgrasp.seeds import stream
-from dexgrasp.selection import free, on_table, select
+from dexgrasp.selection import Selection, free, on_table, select
 from dexgrasp.simulation.protocol import load_protocol
 from dexgrasp.threads import one_thread
 from dexgrasp.training.scorer_settings import ScorerSettings
@@ -101,7 +101,7 @@ def _of_view(
         order = torch.from_numpy(stream(seed, "proposals", index).permutation(len(grasps)))
         rows = _some(model, dataset, grasps, coarse, settings, order)
     grasps, at = grasps[rows], rows % len(seeds)
-    done = on_table(hand, dataset.shape, grasps, LEVEL, model.selection)  # as prediction would have it carried out
+    done = on_table(hand, dataset.shape, grasps, LEVEL, _selection(model, settings))  # as it would be carried out
     truth = scene_truth(dataset, dataset.scene_of(index), view.world_T_camera.double())
     found = truth.outcome(done)
     # 0: one finger or none; else by how many times its weight the object is held.
@@ -132,8 +132,9 @@ def _some(
     on = grasps.object[order] >= 0
     rows = torch.cat([order[on][: DRAWN * settings.per_view], order[~on][: settings.per_view // 10]])
     # What prediction rules out by itself teaches nothing.
-    done = on_table(model.hand, dataset.shape, grasps[rows], LEVEL, model.selection)
-    passed = free(model.hand, dataset.shape, done, coarse[:, :3], LEVEL, model.selection)
+    selection = _selection(model, settings)
+    done = on_table(model.hand, dataset.shape, grasps[rows], LEVEL, selection)
+    passed = free(model.hand, dataset.shape, done, coarse[:, :3], LEVEL, selection)
     return rows[passed][: settings.per_view]
 
 
@@ -143,8 +144,12 @@ def _best(model: GraspNet, grasps: Grasps, coarse: Float[Tensor, "Q 6"], setting
     for number in grasps.object[grasps.object >= 0].unique():
         own = (grasps.object == number).nonzero().flatten()
         known = grasps[own].replace(object=own)  # so that it is known which ones come back
-        rows.append(select(model.hand, known, coarse, settings.chosen, model.selection, LEVEL).object)
+        rows.append(select(model.hand, known, coarse, settings.chosen, _selection(model, settings), LEVEL).object)
     return torch.cat(rows)
+
+
+def _selection(model: GraspNet, settings: ScorerSettings) -> Selection:
+    return replace(model.selection, upright=settings.upright, raised=settings.raised)
 
 
 def _executed(dataset: Dataset, view: View, grasps: Grasps, index: int, protocol: str) -> Float[Tensor, "N"]:

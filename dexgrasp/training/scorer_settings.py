@@ -14,6 +14,8 @@ class ScorerSettings:
     most: int = 256
     hidden: tuple[int, ...] = (256, 128)
     around: tuple[int, ...] = (32, 64)
+    upright: float = 0.0
+    raised: float = 0.0
     per_view: int = 200
     verdicts: int = 0
     rounds: int = 1
@@ -33,6 +35,9 @@ class ScorerSettings:
         for name in ("choices", "most", "per_view", "rounds", "chosen", "epochs", "batch"):
             if getattr(self, name) < 1:
                 raise DexgraspError(f"scorer.{name} of at least 1", str(getattr(self, name)), f"set scorer.{name}")
+        if self.upright < 0 or self.raised < 0:
+            found = f"{self.upright}, {self.raised}"
+            raise DexgraspError("scorer.upright and scorer.raised of at least 0", found, "set them so; 0: nothing")
         if self.verdicts < 0 or self.weight <= 0:
             found = f"{self.verdicts}, {self.weight}"
             raise DexgraspError("scorer.verdicts of at least 0, scorer.weight above it", found, "set them so")

@@ -102,7 +102,8 @@ def _fitted(
 ) -> Scorer:
     """Return a scorer that has learnt what is known, from `start` where it is of the same size."""
     torch.manual_seed(int(stream(seed, "scorer").integers(2**31)))
-    options = settings.choices, settings.most, settings.hidden, settings.around
+    shape = settings.choices, settings.most, settings.hidden, settings.around
+    options = *shape, settings.upright, settings.raised
     scorer = Scorer(model.hand, known.features.shape[1], *options)
     if start is not None and _sizes(start) == _sizes(scorer):
         scorer.load_state_dict(start.state_dict())
