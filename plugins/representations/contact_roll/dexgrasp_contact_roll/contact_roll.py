@@ -1,6 +1,7 @@
 """A grasp told from one fingertip contact without loss: the finger's direction, its roll, and all joints."""
 
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,11 +11,28 @@ from dexgrasp.contact_frame import SINGULAR, contact_frame, finger_direction, ti
 from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import axis_angle, golden_spiral, inverse, pose
 from dexgrasp.grasps import Grasps
+from dexgrasp.hand import Hand
 from dexgrasp.staged_contact import StagedContact
 from dexgrasp.tip_surface import TipSurface
 
 FEWEST = 8
 """Of the anchors: fewer leave directions that none of them can tell."""
+
+
+def upright_frame(normals: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Return rotations [x, y, z] with z the horizontal part of the normal and x up; x axis of a vertical one.
+
+    What cameras see of a normal is wrong by its tilt, at the rims of low things above all, and hands come from above.
+    The frame of paper equation 2 spins where the normal is along the first axis; this one does so where it is vertical.
+    """
+    flat = torch.stack([normals[..., 0], normals[..., 1], torch.zeros_like(normals[..., 0])], dim=-1)
+    length = torch.linalg.vector_norm(flat, dim=-1, keepdim=True)
+    z = torch.where(length > SINGULAR, flat / length.clamp(min=SINGULAR), flat.new_tensor([1.0, 0.0, 0.0]))
+    x = z.new_tensor([0.0, 0.0, 1.0]).expand_as(z)
+    return torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)
+
+
+FRAMES = {"normal": contact_frame, "upright": upright_frame}
 
 
 class ContactRoll(StagedContact):
@@ -28,9 +46,21 @@ class ContactRoll(StagedContact):
 
     Every fingertip contact can be told. Heads: a direction of the whole sphere, the offset from it in its tangent
     plane, and sine and cosine of the roll.
+
+    Args:
+        frame: contact frame in which direction and roll are told: `normal` (paper equation 2), or `upright`, whose z is
+            the horizontal part of the normal and whose x points up (z of the points' frame, the level one).
+        hand, channels, options: see `StagedContact`.
     """
 
     lead, told = 3, 4
+    label_options = ("frame",)
+
+    def __init__(self, hand: Hand, channels: int, *, frame: str = "normal", **options: Any) -> None:
+        if frame not in FRAMES:
+            raise DexgraspError(f"repr.frame to be one of {sorted(FRAMES)}", repr(frame), "choose one of them")
+        self.frame = FRAMES[frame]
+        super().__init__(hand, channels, **options)
 
     @cached_property
     def tips(self) -> TipSurface:
@@ -63,7 +93,7 @@ class ContactRoll(StagedContact):
         self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grasps: Grasps
     ) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, "N"]]:
         """Return (X, Y, roll); every grasp can be told."""
-        frame = contact_frame(normals)
+        frame = self.frame(normals)
         rotation = (grasps.pose @ self._tip(grasps.finger, grasps.joints))[:, :3, :3]
         xyz = (frame.transpose(-1, -2) @ rotation[:, :, :1]).squeeze(-1)
         xy, z = xyz[:, :2], xyz[:, 2:]
@@ -100,7 +130,7 @@ class ContactRoll(StagedContact):
         joints: Float[Tensor, "N J"],
     ) -> Float[Tensor, "N 4 4"]:
         """Turn the distal link first, then lay its surface against the point."""
-        frame = contact_frame(normals)
+        frame = self.frame(normals)
         xyz = finger_direction(told[:, :2], contact_frame(self.anchors.to(told))[anchor])
         u = (frame @ xyz.unsqueeze(-1)).squeeze(-1)
         rotation = axis_angle(u, torch.atan2(told[:, 2], told[:, 3])) @ tip_rotation(u, frame)
