@@ -185,8 +185,21 @@ def test_it_begins_with_the_one_that_a_network_had(tmp_path, monkeypatch, tiny):
     assert model.scorer.options["hidden"] == [32], "of another size it begins with nothing"
 
 
+def test_an_experiment_leaves_out_the_scorer_where_it_is_told_to():
+    settings.register()
+    with initialize_config_dir(str(settings.conf_folder()), version_base="1.3"):
+        for overrides, taught in ((["experiment=shipped", "scorer=none", "meshes=."], False), ([], True)):
+            assert compose("train", overrides=overrides).scorer.taught is taught
+
+
 def test_settings_are_checked():
-    for change in ({"choices": 0}, {"rounds": 0}, {"clear": (0.1, 0.2)}, {"blocked": (0.1, 0.2, 0.3, 1.5)}):
+    for change in (
+        {"choices": 0},
+        {"rounds": 0},
+        {"upright": -0.1},
+        {"clear": (0.1, 0.2)},
+        {"blocked": (0.1, 0.2, 0.3, 1.5)},
+    ):
         with pytest.raises(DexgraspError, match=f"scorer.{next(iter(change))}"):
             ScorerSettings(**change)
 

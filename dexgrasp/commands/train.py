@@ -55,7 +55,8 @@ def main(config: DictConfig) -> None:
 def _run(config: DictConfig, folder: Path, began: float) -> None:
     settings = read(TrainerSettings, config.trainer, "trainer")
     device_of(settings)
-    scoring = read(ScorerSettings, config.scorer, "scorer") if config.scorer else None
+    taught = config.scorer and config.scorer.get("taught", True)
+    scoring = read(ScorerSettings, config.scorer, "scorer") if taught else None
     if config.evaluate:
         Settings.of(config)
     resumed = (folder / state.FILE).is_file()

@@ -10,6 +10,7 @@ from dexgrasp.simulation.protocol import load_protocol
 class ScorerSettings:
     """`conf/scorer`; see there for what each value does."""
 
+    taught: bool = True
     choices: int = 3
     most: int = 256
     hidden: tuple[int, ...] = (256, 128)
@@ -36,7 +37,7 @@ class ScorerSettings:
             if getattr(self, name) < 1:
                 raise DexgraspError(f"scorer.{name} of at least 1", str(getattr(self, name)), f"set scorer.{name}")
         if self.upright < 0 or self.raised < 0:
-            found = f"{self.upright}, {self.raised}"
+            found = f"scorer.upright={self.upright}, scorer.raised={self.raised}"
             raise DexgraspError("scorer.upright and scorer.raised of at least 0", found, "set them so; 0: nothing")
         if self.verdicts < 0 or self.weight <= 0:
             found = f"{self.verdicts}, {self.weight}"
