@@ -15,8 +15,6 @@ from dexgrasp.hand import Hand
 from dexgrasp.staged_contact import StagedContact
 from dexgrasp.tip_surface import TipSurface
 
-FAR = 0.03
-"""Offsets are told in units of this, m."""
 FEWEST = 8
 """Of the anchors: fewer leave directions that none of them can tell."""
 
@@ -56,16 +54,12 @@ class ContactRoll(StagedContact):
     """
 
     lead, told = 3, 4
-    label_options = ("frame", "offset")
+    label_options = ("frame",)
 
-    def __init__(
-        self, hand: Hand, channels: int, *, frame: str = "normal", offset: bool = False, **options: Any
-    ) -> None:
+    def __init__(self, hand: Hand, channels: int, *, frame: str = "normal", **options: Any) -> None:
         if frame not in FRAMES:
             raise DexgraspError(f"repr.frame to be one of {sorted(FRAMES)}", repr(frame), "choose one of them")
-        self.frame, self.offset = FRAMES[frame], offset
-        if offset:
-            self.lead, self.told = 6, 7
+        self.frame = FRAMES[frame]
         super().__init__(hand, channels, **options)
 
     @cached_property
@@ -97,7 +91,7 @@ class ContactRoll(StagedContact):
 
     def measure(
         self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grasps: Grasps
-    ) -> tuple[Float[Tensor, "N L"], Bool[Tensor, "N"]]:
+    ) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, "N"]]:
         """Return (X, Y, roll); every grasp can be told."""
         frame = self.frame(normals)
         rotation = (grasps.pose @ self._tip(grasps.finger, grasps.joints))[:, :3, :3]
@@ -110,33 +104,28 @@ class ContactRoll(StagedContact):
         straight = tip_rotation(rotation[:, :, 0], frame)
         turned = straight.transpose(-1, -2) @ rotation[:, :, 2:]
         roll = torch.atan2(-turned[:, 1], turned[:, 2])
-        lead = [folded, roll]
-        if self.offset:
-            center = (grasps.pose @ self._tip(grasps.finger, grasps.joints))[:, :3, 3:]
-            away = center.squeeze(-1) - self._center(points, normals, grasps.finger, rotation)
-            lead.append((frame.transpose(-1, -2) @ away.unsqueeze(-1)).squeeze(-1) / FAR)
-        return torch.cat(lead, dim=-1), torch.ones(len(points), dtype=torch.bool, device=points.device)
+        return torch.cat([folded, roll], dim=-1), torch.ones(len(points), dtype=torch.bool, device=points.device)
 
-    def relative(self, parameters: Float[Tensor, "N P"], anchor: Int[Tensor, "N"]) -> Float[Tensor, "N T"]:
+    def relative(self, parameters: Float[Tensor, "N P"], anchor: Int[Tensor, "N"]) -> Float[Tensor, "N 4"]:
         """Return u in the anchor's tangent plane, and sine and cosine of the roll."""
         frame = contact_frame(self.anchors.to(parameters))[anchor]
         offset = (frame.transpose(-1, -2) @ self.direction(parameters).unsqueeze(-1)).squeeze(-1)[:, :2]
         roll = parameters[:, 2:3]
-        return torch.cat([offset, roll.sin(), roll.cos(), parameters[:, 3 : self.lead]], dim=-1)
+        return torch.cat([offset, roll.sin(), roll.cos()], dim=-1)
 
     def miss(
-        self, told: Float[Tensor, "N T"], parameters: Float[Tensor, "N P"], anchor: Int[Tensor, "N"]
+        self, told: Float[Tensor, "N 4"], parameters: Float[Tensor, "N P"], anchor: Int[Tensor, "N"]
     ) -> Float[Tensor, "N"]:
         """Return the distances of the offset and of the roll's sine and cosine."""
         off = told - self.relative(parameters, anchor)
-        return sum(torch.linalg.vector_norm(part, dim=-1) for part in off.split([2, 2, self.told - 4], dim=-1))
+        return torch.linalg.vector_norm(off[:, :2], dim=-1) + torch.linalg.vector_norm(off[:, 2:], dim=-1)
 
     def base(
         self,
         points: Float[Tensor, "N 3"],
         normals: Float[Tensor, "N 3"],
         finger: Int[Tensor, "N"],
-        told: Float[Tensor, "N T"],
+        told: Float[Tensor, "N 4"],
         anchor: Int[Tensor, "N"],
         joints: Float[Tensor, "N J"],
     ) -> Float[Tensor, "N 4 4"]:
@@ -145,21 +134,9 @@ class ContactRoll(StagedContact):
         xyz = finger_direction(told[:, :2], contact_frame(self.anchors.to(told))[anchor])
         u = (frame @ xyz.unsqueeze(-1)).squeeze(-1)
         rotation = axis_angle(u, torch.atan2(told[:, 2], told[:, 3])) @ tip_rotation(u, frame)
-        center = self._center(points, normals, finger, rotation)
-        if self.offset:
-            center = center + FAR * (frame @ told[:, 4:].unsqueeze(-1)).squeeze(-1)
-        return pose(rotation, center) @ inverse(self._tip(finger, joints))
-
-    def _center(
-        self,
-        points: Float[Tensor, "N 3"],
-        normals: Float[Tensor, "N 3"],
-        finger: Int[Tensor, "N"],
-        rotation: Float[Tensor, "N 3 3"],
-    ) -> Float[Tensor, "N 3"]:
-        """Return where the fingertips' frames are that touch the points there."""
         inward = -(rotation.transpose(-1, -2) @ normals.unsqueeze(-1)).squeeze(-1)
-        return points - (rotation @ self.tip_contacts(finger, inward).unsqueeze(-1)).squeeze(-1)
+        center = points - (rotation @ self.tip_contacts(finger, inward).unsqueeze(-1)).squeeze(-1)
+        return pose(rotation, center) @ inverse(self._tip(finger, joints))
 
     def _tip(self, finger: Int[Tensor, "N"], joints: Float[Tensor, "N J"]) -> Float[Tensor, "N 4 4"]:
         return self.hand.fingertips(joints)[torch.arange(len(finger), device=finger.device), finger]
