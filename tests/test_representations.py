@@ -9,7 +9,7 @@ from dexgrasp_grasp_type.taxonomy import taxonomy
 from torch.nn.functional import normalize
 
 from dexgrasp.errors import DexgraspError, UnsupportedHand
-from dexgrasp.geometry import inverse, orthonormal, pose, rotate, transform
+from dexgrasp.geometry import axis_angle, inverse, orthonormal, pose, rotate, transform
 from dexgrasp.grasps import Grasps
 from dexgrasp.plugins import load_hand
 from dexgrasp.tip_surface import REACH, TipSurface
@@ -47,6 +47,27 @@ def test_every_fingertip_contact_is_told(hand, cls):
     assert targets.encodable.all() and targets.parameters.shape == (120, model.size)
     torch.testing.assert_close(told.pose, grasps.pose, atol=1e-6, rtol=0)
     torch.testing.assert_close(told.joints, grasps.joints, atol=1e-6, rtol=0)
+
+
+def test_an_upright_frame_loses_nothing_and_does_not_lean_with_the_normal(hand):
+    model, grasps = ContactRoll(hand, 16, frame="upright"), grasps_of(hand)
+    points, normals = touched(model, grasps)
+    normals[0], normals[1] = normals.new_tensor([0.0, 0.0, 1.0]), normals.new_tensor([0.0, 0.0, -1.0])
+    targets, told = there_and_back(model, points, normals, grasps)
+    assert targets.encodable.all() and targets.parameters.isfinite().all()
+    torch.testing.assert_close(told.pose[:, :3, :3], grasps.pose[:, :3, :3], atol=1e-6, rtol=0)
+    torch.testing.assert_close(told.pose[2:], grasps.pose[2:], atol=1e-6, rtol=0)
+    # A normal that leans by more says the same; one that is turned about the vertical, with the grasp, too.
+    leaning = normals.clone()
+    leaning[:, 2] = normals[:, 2] + 0.5
+    again = model.encode(points, normalize(leaning, dim=-1), grasps)
+    torch.testing.assert_close(again.parameters[2:], targets.parameters[2:], atol=1e-6, rtol=0)
+    turn = pose(axis_angle(points.new_tensor([0.0, 0.0, 1.0]), points.new_tensor(0.7)), points.new_zeros(3))
+    turns = turn.expand(len(points), 4, 4)
+    turned = model.encode(transform(turns, points), rotate(turns, normals), grasps.moved(turn))
+    torch.testing.assert_close(turned.parameters[2:], targets.parameters[2:], atol=1e-6, rtol=0)
+    with pytest.raises(DexgraspError, match=r"repr\.frame"):
+        ContactRoll(hand, 16, frame="sideways")
 
 
 def test_contact_roll_tells_7_numbers_of_a_barrett_hand(hand):
