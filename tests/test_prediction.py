@@ -56,6 +56,9 @@ class Told:
     def propose(self, level):
         return self.grasps
 
+    def selecting(self, selection=None):
+        return selection or self.selection
+
 
 def above(hand, heights, joints, turns=(0.0,)) -> Grasps:
     """Grasps straight from above, in the level frame of `cube`; heights of the base above the table."""
