@@ -22,7 +22,7 @@ from dexgrasp.progress import track
 from dexgrasp.scene import View
 from dexgrasp.scorer import COARSE, coarse_points, surroundings
 from dexgrasp.seeds import stream
-from dexgrasp.selection import Selection, free, on_table, select
+from dexgrasp.selection import free, on_table, select
 from dexgrasp.simulation.protocol import load_protocol
 from dexgrasp.threads import one_thread
 from dexgrasp.training.scorer_settings import ScorerSettings
@@ -91,17 +91,19 @@ def _of_view(
     cloud = torch.cat([view.points, view.normals], dim=1)
     features, seeds, told = model.told(cloud, choices=settings.choices, most=settings.most)
     grasps = Grasps.cat(told).replace(object=view.instance[seeds].repeat(len(told)))
+    # As prediction would have them carried out; the scorer sees them as they are told.
+    set_up = replace(model.selection, upright=settings.upright, raised=settings.raised)
+    done = on_table(hand, dataset.shape, grasps, LEVEL, set_up)
     coarse = coarse_points(cloud, SPREAD)
     if own:
         at, around = cloud[seeds].repeat(len(told), 1), surroundings(hand, grasps, coarse[:COARSE])
         assert model.scorer is not None
         score = model.scorer(features, at, grasps, around)
-        rows = _best(model, grasps.replace(quality=score.sigmoid()), coarse, settings)
+        rows = _best(model, done.replace(quality=score.sigmoid()), coarse, settings)
     else:
         order = torch.from_numpy(stream(seed, "proposals", index).permutation(len(grasps)))
-        rows = _some(model, dataset, grasps, coarse, settings, order)
-    grasps, at = grasps[rows], rows % len(seeds)
-    done = on_table(hand, dataset.shape, grasps, LEVEL, _selection(model, settings))  # as it would be carried out
+        rows = _some(model, dataset, done, coarse, settings, order)
+    grasps, done, at = grasps[rows], done[rows], rows % len(seeds)
     truth = scene_truth(dataset, dataset.scene_of(index), view.world_T_camera.double())
     found = truth.outcome(done)
     # 0: one finger or none; else by how many times its weight the object is held.
@@ -132,9 +134,7 @@ def _some(
     on = grasps.object[order] >= 0
     rows = torch.cat([order[on][: DRAWN * settings.per_view], order[~on][: settings.per_view // 10]])
     # What prediction rules out by itself teaches nothing.
-    selection = _selection(model, settings)
-    done = on_table(model.hand, dataset.shape, grasps[rows], LEVEL, selection)
-    passed = free(model.hand, dataset.shape, done, coarse[:, :3], LEVEL, selection)
+    passed = free(model.hand, dataset.shape, grasps[rows], coarse[:, :3], LEVEL, model.selection)
     return rows[passed][: settings.per_view]
 
 
@@ -144,12 +144,8 @@ def _best(model: GraspNet, grasps: Grasps, coarse: Float[Tensor, "Q 6"], setting
     for number in grasps.object[grasps.object >= 0].unique():
         own = (grasps.object == number).nonzero().flatten()
         known = grasps[own].replace(object=own)  # so that it is known which ones come back
-        rows.append(select(model.hand, known, coarse, settings.chosen, _selection(model, settings), LEVEL).object)
+        rows.append(select(model.hand, known, coarse, settings.chosen, model.selection, LEVEL).object)
     return torch.cat(rows)
-
-
-def _selection(model: GraspNet, settings: ScorerSettings) -> Selection:
-    return replace(model.selection, upright=settings.upright, raised=settings.raised)
 
 
 def _executed(dataset: Dataset, view: View, grasps: Grasps, index: int, protocol: str) -> Float[Tensor, "N"]:
