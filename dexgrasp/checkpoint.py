@@ -133,10 +133,10 @@ def load_start(module: torch.nn.Module, hand: Hand, config: Mapping[str, Any], p
     trained, now = notes["config"], {key: plain(config[key]) for key in ("repr", "backbone")}
     other = [f"{kind}={trained[kind]['name']}" for kind in now if trained[kind]["name"] != now[kind]["name"]]
     differing = other or [
-        f"{kind}.{key}={_word(value)}"
+        f"{kind}.{key}={_word(trained[kind][key])}" if key in trained[kind] else f"no {kind}.{key}"
         for kind, settings in now.items()
-        for key, value in trained[kind].items()
-        if value != settings.get(key)
+        for key in {**trained[kind], **settings}
+        if trained[kind].get(key) != settings.get(key)
     ]
     shapes, given = ({key: value.shape for key, value in each.items()} for each in (module.state_dict(), tensors))
     if other or shapes != given:

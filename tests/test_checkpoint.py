@@ -113,9 +113,9 @@ def test_a_training_starts_only_from_weights_of_its_own_network(tmp_path, caplog
     hand, path, layer = load_hand("barrett"), tmp_path / checkpoint.FILE, torch.nn.Linear(2, 3)
     notes = {"kind": "model", "hand": kinematics(hand), "config": config}
     write_tensors(path, {"weight": torch.ones(3, 2), "bias": torch.ones(3)}, notes)
-    composed = OmegaConf.create({**config, "repr": {**config["repr"], "alpha": 2.0, "new": None}})
+    composed = OmegaConf.create({**config, "repr": {**config["repr"], "alpha": 2.0, "new": None, "frame": "upright"}})
     load_start(layer, hand, composed, path)  # weights of losses may differ, options of a later version may come
-    assert layer.weight.min() == 1 and "trained with repr.alpha=1.0;" in caplog.text
+    assert layer.weight.min() == 1 and "trained with repr.alpha=1.0 no repr.frame;" in caplog.text
     for kind in ("repr", "backbone"):
         with pytest.raises(DexgraspError, match=f"of a network with {kind}={config[kind]['name']}\n"):
             load_start(layer, hand, {**config, kind: {"name": "other"}}, path)
