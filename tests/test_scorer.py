@@ -185,6 +185,15 @@ def test_it_begins_with_the_one_that_a_network_had(tmp_path, monkeypatch, tiny):
     assert model.scorer.options["hidden"] == [32], "of another size it begins with nothing"
 
 
+def test_grasps_stay_set_up_as_the_network_was_taught_where_nothing_else_is_told(hand):
+    start = Scorer(hand, 8, upright=0.5, raised=0.02)
+    for told, upright, raised in ((None, 0.5, 0.02), (0.0, 0.0, 0.02), (0.3, 0.3, 0.02)):
+        settings = ScorerSettings(upright=told).going_on_from(start)
+        assert (settings.upright, settings.raised) == (upright, raised)
+    settings = ScorerSettings(raised=0.01).going_on_from(None)
+    assert (settings.upright, settings.raised) == (0.0, 0.01)
+
+
 def test_an_experiment_leaves_out_the_scorer_where_it_is_told_to():
     settings.register()
     with initialize_config_dir(str(settings.conf_folder()), version_base="1.3"):

@@ -1,8 +1,10 @@
 """How the scorer is taught."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 from dexgrasp.errors import DexgraspError
+from dexgrasp.scorer import Scorer
 from dexgrasp.simulation.protocol import load_protocol
 
 
@@ -15,8 +17,8 @@ class ScorerSettings:
     most: int = 256
     hidden: tuple[int, ...] = (256, 128)
     around: tuple[int, ...] = (32, 64)
-    upright: float = 0.0
-    raised: float = 0.0
+    upright: float | None = None
+    raised: float | None = None
     per_view: int = 200
     verdicts: int = 0
     rounds: int = 1
@@ -36,7 +38,7 @@ class ScorerSettings:
         for name in ("choices", "most", "per_view", "rounds", "chosen", "epochs", "batch"):
             if getattr(self, name) < 1:
                 raise DexgraspError(f"scorer.{name} of at least 1", str(getattr(self, name)), f"set scorer.{name}")
-        if self.upright < 0 or self.raised < 0:
+        if min(self.upright or 0, self.raised or 0) < 0:
             found = f"scorer.upright={self.upright}, scorer.raised={self.raised}"
             raise DexgraspError("scorer.upright and scorer.raised of at least 0", found, "set them so; 0: nothing")
         if self.verdicts < 0 or self.weight <= 0:
@@ -49,3 +51,9 @@ class ScorerSettings:
                 raise DexgraspError(f"scorer.{name}: {wanted} shares in 0..1", str(worth), f"set scorer.{name}")
         if list(self.capacity) != sorted(self.capacity):
             raise DexgraspError("scorer.capacity in ascending order", str(self.capacity), "set scorer.capacity")
+
+    def going_on_from(self, start: Scorer | None) -> Self:
+        """Return these, with what is left open (None) as `start` was taught, or 0 without one."""
+        known = {} if start is None else start.options
+        left = {key: known.get(key, 0.0) for key in ("upright", "raised") if getattr(self, key) is None}
+        return replace(self, **left)
