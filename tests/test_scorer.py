@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 from dexgrasp import config as settings
 from dexgrasp import selection
@@ -20,7 +21,7 @@ from dexgrasp.statistics import roc_area
 from dexgrasp.table import find_table
 from dexgrasp.testing.samples import seen
 from dexgrasp.training import proposals, scoring
-from dexgrasp.training.scorer_settings import ScorerSettings
+from dexgrasp.training.scorer_settings import ScorerSettings, scorer_settings
 
 OPEN = Selection(depth=None, table=None)
 
@@ -185,13 +186,16 @@ def test_it_begins_with_the_one_that_a_network_had(tmp_path, monkeypatch, tiny):
     assert model.scorer.options["hidden"] == [32], "of another size it begins with nothing"
 
 
-def test_grasps_stay_set_up_as_the_network_was_taught_where_nothing_else_is_told(hand):
-    start = Scorer(hand, 8, upright=0.5, raised=0.02)
-    for told, upright, raised in ((None, 0.5, 0.02), (0.0, 0.0, 0.02), (0.3, 0.3, 0.02)):
-        settings = ScorerSettings(upright=told).going_on_from(start)
-        assert (settings.upright, settings.raised) == (upright, raised)
-    settings = ScorerSettings(raised=0.01).going_on_from(None)
-    assert (settings.upright, settings.raised) == (0.0, 0.01)
+def test_a_scorer_is_taught_as_the_one_that_it_begins_with_was_where_nothing_else_is_told(hand):
+    start = Scorer(hand, 8, choices=1, most=640, hidden=[64], upright=0.5, raised=0.02)
+    config = {"upright": None, "raised": None, "choices": None, "most": 80, "hidden": None}
+    for told, upright in ((None, 0.5), (0.0, 0.0), (0.3, 0.3)):
+        read = scorer_settings({**config, "upright": told}, start)
+        assert (read.upright, read.raised, read.choices, read.most, read.hidden) == (upright, 0.02, 1, 80, (64,))
+    alone = scorer_settings(OmegaConf.create({**config, "raised": 0.01}), None)
+    assert alone == ScorerSettings(raised=0.01, most=80)
+    with pytest.raises(DexgraspError, match=r"scorer\.choices"):
+        scorer_settings({**config, "choices": "many"}, start)
 
 
 def test_an_experiment_leaves_out_the_scorer_where_it_is_told_to():

@@ -29,7 +29,7 @@ from dexgrasp.seeds import stream
 from dexgrasp.settings import read
 from dexgrasp.training import state
 from dexgrasp.training.loop import device_of, train
-from dexgrasp.training.scorer_settings import ScorerSettings
+from dexgrasp.training.scorer_settings import scorer_settings
 from dexgrasp.training.scoring import fit_scorer
 from dexgrasp.training.settings import TrainerSettings
 
@@ -56,7 +56,6 @@ def _run(config: DictConfig, folder: Path, began: float) -> None:
     settings = read(TrainerSettings, config.trainer, "trainer")
     device_of(settings)
     taught = config.scorer and config.scorer.get("taught", True)
-    scoring = read(ScorerSettings, config.scorer, "scorer") if taught else None
     if config.evaluate:
         Settings.of(config)
     resumed = (folder / state.FILE).is_file()
@@ -65,6 +64,9 @@ def _run(config: DictConfig, folder: Path, began: float) -> None:
     if start is not None:  # before any data: what does not fit is told now
         tuned = build_model(config, config.dataset.views.framing.points)
         load_start(tuned, tuned.hand, config, start)
+    going_on = taught and config.init_from is not None
+    before = load_model(find_checkpoint(config.init_from)).scorer if going_on else None
+    scoring = scorer_settings(config.scorer, before) if taught else None
     torch.manual_seed(int(stream(config.seed, "weights").integers(2**31)))
     dataset = ensure(config.dataset, config.hand, config.repr)
     print(table(summary(dataset)))
@@ -100,7 +102,6 @@ def _run(config: DictConfig, folder: Path, began: float) -> None:
     save_model(folder / FILE, model.cpu(), facts)
     if scoring is not None:
         workers = config.dataset.workers or joblib.cpu_count()
-        before = None if config.init_from is None else load_model(find_checkpoint(config.init_from)).scorer
         scored = fit_scorer(model, folder / FILE, dataset, scoring, config.seed, workers, before)
         results["scorer"] = dataclasses.asdict(scored)
         results["times"]["scorer"] = scored.seconds

@@ -1,11 +1,18 @@
 """How the scorer is taught."""
 
-from dataclasses import dataclass, replace
-from typing import Self
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from omegaconf import OmegaConf
 
 from dexgrasp.errors import DexgraspError
 from dexgrasp.scorer import Scorer
+from dexgrasp.settings import read
 from dexgrasp.simulation.protocol import load_protocol
+
+FROM_START = ("most", "choices", "hidden", "around", "upright", "raised")
+"""What, left open, is as the scorer has it that one begins with."""
 
 
 @dataclass(frozen=True)
@@ -17,8 +24,8 @@ class ScorerSettings:
     most: int = 256
     hidden: tuple[int, ...] = (256, 128)
     around: tuple[int, ...] = (32, 64)
-    upright: float | None = None
-    raised: float | None = None
+    upright: float = 0.0
+    raised: float = 0.0
     per_view: int = 200
     verdicts: int = 0
     rounds: int = 1
@@ -38,7 +45,7 @@ class ScorerSettings:
         for name in ("choices", "most", "per_view", "rounds", "chosen", "epochs", "batch"):
             if getattr(self, name) < 1:
                 raise DexgraspError(f"scorer.{name} of at least 1", str(getattr(self, name)), f"set scorer.{name}")
-        if min(self.upright or 0, self.raised or 0) < 0:
+        if self.upright < 0 or self.raised < 0:
             found = f"scorer.upright={self.upright}, scorer.raised={self.raised}"
             raise DexgraspError("scorer.upright and scorer.raised of at least 0", found, "set them so; 0: nothing")
         if self.verdicts < 0 or self.weight <= 0:
@@ -52,8 +59,15 @@ class ScorerSettings:
         if list(self.capacity) != sorted(self.capacity):
             raise DexgraspError("scorer.capacity in ascending order", str(self.capacity), "set scorer.capacity")
 
-    def going_on_from(self, start: Scorer | None) -> Self:
-        """Return these, with what is left open (None) as `start` was taught, or 0 without one."""
-        known = {} if start is None else start.options
-        left = {key: known.get(key, 0.0) for key in ("upright", "raised") if getattr(self, key) is None}
-        return replace(self, **left)
+
+def scorer_settings(config: Mapping[str, Any], start: Scorer | None) -> ScorerSettings:
+    """Return what `conf/scorer` says; what it leaves open (null) is as `start` has it, the default without one.
+
+    Raises DexgraspError as `dexgrasp.settings.read` does.
+    """
+    told = OmegaConf.to_container(config, resolve=True) if OmegaConf.is_config(config) else dict(config)
+    assert isinstance(told, dict)
+    known = {} if start is None else start.options
+    left = [key for key in FROM_START if told.get(key) is None]
+    told = {str(key): value for key, value in told.items() if key not in left}
+    return read(ScorerSettings, told | {key: known[key] for key in left if key in known}, "scorer")

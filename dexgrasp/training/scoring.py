@@ -54,10 +54,10 @@ def fit_scorer(
 ) -> ScorerSummary:
     """Give `model` (on the CPU, as it lies at `path`) a scorer taught on the dataset's training views.
 
-    `start`, where it is of the same size, is what it begins with, else it begins with nothing. Grasps are set up as
-    `start` was taught unless `settings` say otherwise. The result does not depend on the number of workers.
+    `start`, where it is of the same size, is what it begins with, else it begins with nothing. The result does not
+    depend on the number of workers.
     """
-    began, settings = time.perf_counter(), settings.going_on_from(start)
+    began = time.perf_counter()
     views = dataset.split("train")[: settings.views]
     known = propose(path, dataset, views, settings, seed, workers, "scorer")
     if not len(known):  # nothing to learn from: the heads' own score stays
@@ -103,8 +103,8 @@ def _fitted(
     """Return a scorer that has learnt what is known, from `start` where it is of the same size."""
     torch.manual_seed(int(stream(seed, "scorer").integers(2**31)))
     shape = settings.choices, settings.most, settings.hidden, settings.around
-    set_up = settings.upright or 0.0, settings.raised or 0.0
-    scorer = Scorer(model.hand, known.features.shape[1], *shape, *set_up)
+    options = *shape, settings.upright, settings.raised
+    scorer = Scorer(model.hand, known.features.shape[1], *options)
     if start is not None and _sizes(start) == _sizes(scorer):
         scorer.load_state_dict(start.state_dict())
     _fit(scorer, known, settings, seed)
