@@ -126,6 +126,21 @@ def test_fine_tuning_starts_from_the_weights(made: Path, tiny_job: list[str], da
 
 
 @pytest.mark.slow
+def test_without_a_step_the_scorer_alone_is_taught(made: Path, tiny_job: list[str]) -> None:
+    home, folder = made.parents[2], made.parent / "taught"
+    words = [*tiny_job, "trainer.steps=0", "evaluate=false", f"hydra.run.dir={folder}"]
+    status, _, err = run(home, "train", *words)
+    assert status == 2 and "init_from" in err and "Traceback" not in err
+    status, out, err = run(home, "train", *words, "dataset.seed=1", f"init_from={made}")
+    assert status == 0, out + err
+    assert "labels" not in out and "graspable" not in out
+    before, after = load_file(made / "model.safetensors"), load_file(folder / "model.safetensors")
+    network = {key for key in before if not key.startswith("scorer.")}
+    assert len(network) > 20 and all(torch.equal(before[key], after[key]) for key in network)
+    assert any(not torch.equal(before[key], after[key]) for key in before.keys() - network)
+
+
+@pytest.mark.slow
 def test_a_multirun_through_submitit_ends_with_one_table(made: Path, tiny_job: list[str]) -> None:
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     words = ["train", "-m", "hydra/launcher=submitit_local", "repr=contact,pose", *tiny_job]

@@ -17,7 +17,7 @@ from dexgrasp.study.table import line, write_tables
 from dexgrasp.study.work import work
 
 EXPERIMENTS = sorted(path.stem for path in (config.conf_folder() / "experiment").glob("*.yaml"))
-TRAININGS = ("none", "smoke", "hands", "shipped")
+TRAININGS = ("none", "smoke", "hands", "shipped", "shipped_scorer")
 
 PLAIN = {
     "title": "T",
@@ -44,7 +44,7 @@ def composed(command: str, words: tuple[str, ...] | list[str]):
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_experiment_composes_and_so_does_all_that_it_runs(name: str, tmp_path: Path) -> None:
     if name in TRAININGS:
-        more = ["meshes=DIR"] if name == "shipped" else []
+        more = ["meshes=DIR"] if name.startswith("shipped") else []
         OmegaConf.to_container(composed("train", [f"experiment={name}", *more]), resolve=True)
         return
     study = Study.read(plain(composed("study", [f"experiment={name}", "meshes=DIR"])))
@@ -68,6 +68,16 @@ def test_a_study_as_commands(tmp_path: Path) -> None:
     assert len({job.folder for job in jobs}) == len(jobs)
 
 
+def test_a_method_may_stand_on_an_earlier_one(tmp_path: Path) -> None:
+    tuned = {"title": "Tuned", "make": ["train", "init_from={made:net}"], "judge": ["model={made}"]}
+    again = {"title": "Again", "judge": ["model={made:net}", "top_k=1"]}
+    methods = {"net": PLAIN["methods"]["net"], "tuned": tuned, "again": again}
+    net, _, made, judged, other = Study.read(PLAIN | {"methods": methods, "seeds": [3], "extras": {}}).jobs(tmp_path)
+    assert made.needs == (net.folder,) and f"init_from={net.folder}" in made.words and "seed=3" in made.words
+    assert judged.needs == (made.folder,) and f"model={made.folder}" in judged.words
+    assert other.needs == (net.folder,) and f"model={net.folder}" in other.words
+
+
 @pytest.mark.parametrize(
     ("change", "word"),
     [
@@ -76,6 +86,8 @@ def test_a_study_as_commands(tmp_path: Path) -> None:
         ({"methods": {"a": {"title": "A", "judge": ["model={made}"]}}}, "make"),
         ({"methods": {"a": {"title": "A", "judge": [], "make": ["eval"]}}}, "train or fit"),
         ({"methods": {"a": {"title": "A", "judge": [], "paper": {"sr": 1}}}}, "SR, CR, quality"),
+        ({"methods": {"a": {"title": "A", "judge": [], "make": ["train", "init_from={made}"]}}}, "itself"),
+        ({"methods": {"a": {"title": "A", "judge": ["model={made:b}"]}}}, "b"),
         ({"seeds": ["x"]}, "seeds"),
     ],
 )

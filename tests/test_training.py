@@ -163,7 +163,7 @@ def test_schedule_warms_up_and_decays():
     assert factors[0] == 0.5 and factors[1] == 1.0 and factors[1] >= factors[2] > factors[5] > 0
 
 
-@pytest.mark.parametrize("change", [{"shards": 3}, {"precision": "half"}, {"optimizer": "lion"}])
+@pytest.mark.parametrize("change", [{"steps": -1}, {"shards": 3}, {"precision": "half"}, {"optimizer": "lion"}])
 def test_bad_settings_are_named(change):
     with pytest.raises(DexgraspError):
         TrainerSettings(**{"steps": 1, "batch": 4, "shards": 2} | change)

@@ -28,7 +28,7 @@ from dexgrasp.representation import Targets
 from dexgrasp.seeds import stream
 from dexgrasp.settings import read
 from dexgrasp.training import state
-from dexgrasp.training.loop import device_of, train
+from dexgrasp.training.loop import TrainingSummary, device_of, train
 from dexgrasp.training.scorer_settings import scorer_settings
 from dexgrasp.training.scoring import fit_scorer
 from dexgrasp.training.settings import TrainerSettings
@@ -60,6 +60,10 @@ def _run(config: DictConfig, folder: Path, began: float) -> None:
         Settings.of(config)
     resumed = (folder / state.FILE).is_file()
     start = None if config.init_from is None or resumed else find_checkpoint(config.init_from)
+    if not settings.steps and (start is None or not taught):
+        found = f"init_from={config.init_from}, scorer.taught={bool(taught)}"
+        remedy = "give the network whose scorer is to be taught, or trainer.steps"
+        raise DexgraspError("trainer.steps=0 with init_from and a scorer: it alone is taught then", found, remedy)
     tuned = None
     if start is not None:  # before any data: what does not fit is told now
         tuned = build_model(config, config.dataset.views.framing.points)
@@ -68,16 +72,18 @@ def _run(config: DictConfig, folder: Path, began: float) -> None:
     before = load_model(find_checkpoint(config.init_from)).scorer if going_on else None
     scoring = scorer_settings(config.scorer, before) if taught else None
     torch.manual_seed(int(stream(config.seed, "weights").integers(2**31)))
-    dataset = ensure(config.dataset, config.hand, config.repr)
+    dataset = ensure(config.dataset, config.hand, config.repr if settings.steps else None)
     print(table(summary(dataset)))
     model = tuned or build_model(config, dataset.config["views"]["framing"]["points"], dataset.hand)
     if tuned is None:  # else what was learnt then goes on
         model.representation.prepare(dataset.grasps(index) for index in range(len(dataset.objects)))
-    made = time.perf_counter()
-    splits = {name: samples(dataset, model, name) for name in ("train", "validation") if dataset.split(name)}
-    print(f"{len(splits['train'])} views, {splits['train'].graspable:.1%} of the seed points graspable")
-    collected = time.perf_counter()
-    trained = train(model, splits["train"], splits.get("validation"), settings, config.seed, folder)
+    made = collected = time.perf_counter()
+    trained = TrainingSummary(0, 0.0, 1, "cpu")
+    if settings.steps:
+        splits = {name: samples(dataset, model, name) for name in ("train", "validation") if dataset.split(name)}
+        print(f"{len(splits['train'])} views, {splits['train'].graspable:.1%} of the seed points graspable")
+        collected = time.perf_counter()
+        trained = train(model, splits["train"], splits.get("validation"), settings, config.seed, folder)
     if trained.interrupted:
         print(f"stopped after {trained.steps} of {settings.steps} steps", file=sys.stderr)
         raise KeyboardInterrupt

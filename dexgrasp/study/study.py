@@ -1,6 +1,7 @@
 """What a study compares, as a config says it, and the commands that it comes to."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -8,8 +9,8 @@ from typing import Any
 from dexgrasp.errors import DexgraspError
 from dexgrasp.settings import read
 
-MADE = "{made}"
-"""In a command: the folder in which the method was made, with the same seed."""
+MADE = re.compile(r"\{made(?::(\w+))?\}")
+"""In a command: the folder in which the method was made, or, {made:NAME}, an earlier one; with the same seed."""
 DATA = "{data}"
 """In an extra command: the study's overrides of the dataset."""
 MAKERS = ("train", "fit")
@@ -90,8 +91,7 @@ class Study:
                 raise DexgraspError(
                     f"methods.{name}.make to begin with {' or '.join(MAKERS)}", method.make[0], "mend it"
                 )
-            if not method.make and any(MADE in word for word in method.judge):
-                raise DexgraspError(f"methods.{name}.make, which {MADE} stands for", "none", "say how it is made")
+            study._check(name, method)
         for where, paper in [(f"methods.{name}", each.paper) for name, each in study.methods.items()] + [
             (f"judgements.{name}.paper.{method}", figures)
             for name, each in study.judgements.items()
@@ -102,6 +102,18 @@ class Study:
                     f"published figures of {where}: {', '.join(FIGURES)}", ", ".join(strange), "mend it"
                 )
         return study
+
+    def _check(self, name: str, method: Method) -> None:
+        """Raise DexgraspError where a method stands on something that is not made before it."""
+        earlier = [each for each in list(self.methods)[: list(self.methods).index(name)] if self.methods[each].make]
+        if not method.make and name in _made(method.judge, name):
+            raise DexgraspError(f"methods.{name}.make, which {{made}} stands for", "none", "say how it is made")
+        if name in _made(method.make, name):
+            remedy = "name an earlier method: {made:NAME}"
+            raise DexgraspError(f"methods.{name}.make without {{made}}, itself", "it", remedy)
+        if strange := {*_made(method.make, name), *_made(method.judge, name)} - {name, *earlier}:
+            remedy = f"name one that is made before {name}"
+            raise DexgraspError(f"methods.{name}: {{made:NAME}} of {earlier}", ", ".join(sorted(strange)), remedy)
 
     def made(self, folder: Path, method: str, seed: int) -> Path:
         """Return where a method is made."""
@@ -117,16 +129,29 @@ class Study:
         for seed in self.seeds:
             for name, method in self.methods.items():
                 home = self.made(folder, name, seed)
+                homes = {other: self.made(folder, other, seed) for other in self.methods}
                 if method.make:
                     own = (*self.train, "evaluate=false") if method.make[0] == "train" else ()
-                    words = (method.make[0], *self.data, *own, *method.make[1:], f"seed={seed}")
-                    jobs.append(Job(f"{name}, seed {seed}: {method.make[0]}", words, home))
+                    words = (method.make[0], *self.data, *own, *_placed(method.make[1:], name, homes), f"seed={seed}")
+                    needs = tuple(homes[other] for other in _made(method.make, name))
+                    jobs.append(Job(f"{name}, seed {seed}: {method.make[0]}", words, home, needs))
                 for rule, judgement in self.judgements.items():
-                    chosen = tuple(word.replace(MADE, str(home)) for word in method.judge)
+                    chosen = _placed(method.judge, name, homes)
                     words = ("eval", *self.judge, *judgement.overrides, *chosen, f"seed={seed}")
                     place = self.judged(folder, rule, name, seed)
-                    jobs.append(Job(f"{name}, seed {seed}: {rule}", words, place, (home,) if method.make else ()))
+                    wanted = [*([name] if method.make else []), *_made(method.judge, name)]
+                    needs = tuple(homes[other] for other in dict.fromkeys(wanted))
+                    jobs.append(Job(f"{name}, seed {seed}: {rule}", words, place, needs))
         for name, words in self.extras.items():
             spread = tuple(each for word in words for each in (self.data if word == DATA else (word,)))
             jobs.append(Job(name, spread, folder / "extras" / name))
         return jobs
+
+
+def _made(words: tuple[str, ...], own: str) -> Iterator[str]:
+    """Yield the methods on whose folders a command of method `own` stands."""
+    return (found[1] or own for word in words for found in MADE.finditer(word))
+
+
+def _placed(words: tuple[str, ...], own: str, homes: Mapping[str, Path]) -> tuple[str, ...]:
+    return tuple(MADE.sub(lambda found: str(homes[found[1] or own]), word) for word in words)

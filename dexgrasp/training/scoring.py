@@ -54,8 +54,8 @@ def fit_scorer(
 ) -> ScorerSummary:
     """Give `model` (on the CPU, as it lies at `path`) a scorer taught on the dataset's training views.
 
-    `start`, where it is of the same size, is what it begins with, else it begins with nothing. The result does not
-    depend on the number of workers.
+    `start`, where it is of the same size and not `settings.anew`, is what it begins with, else it begins with nothing.
+    The result does not depend on the number of workers.
     """
     began = time.perf_counter()
     views = dataset.split("train")[: settings.views]
@@ -65,7 +65,8 @@ def fit_scorer(
     model.scorer = scorer = _fitted(model, known, settings, seed, start)
     for turn in range(1, settings.rounds):
         told = f"scorer, its own choice {turn}"
-        known = Proposals.cat([known, _choose(model, dataset, views, settings, seed, workers, told)])
+        some = _spread(views, settings.own_views)
+        known = Proposals.cat([known, _choose(model, dataset, some, settings, seed, workers, told)])
         model.scorer = scorer = _fitted(model, known, settings, seed, start)
     area = before = verdicts = own = None
     if unseen := dataset.split("validation"):
@@ -74,7 +75,8 @@ def fit_scorer(
         area, before = roc_area(told_so, rest.holds), roc_area(rest.score, rest.holds)
         verdicts = _reliable(told_so, rest)
         if settings.rounds > 1:
-            chosen = _choose(model, dataset, unseen, settings, seed, workers, "scorer, validation of its choice")
+            some = _spread(unseen, settings.own_views)
+            chosen = _choose(model, dataset, some, settings, seed, workers, "scorer, validation of its choice")
             own = _reliable(_told_by(scorer, chosen), chosen)
             rest = Proposals.cat([rest, chosen])
             told_so = _told_by(scorer, rest)
@@ -105,7 +107,7 @@ def _fitted(
     shape = settings.choices, settings.most, settings.hidden, settings.around
     options = *shape, settings.upright, settings.raised
     scorer = Scorer(model.hand, known.features.shape[1], *options)
-    if start is not None and _sizes(start) == _sizes(scorer):
+    if start is not None and not settings.anew and _sizes(start) == _sizes(scorer):
         scorer.load_state_dict(start.state_dict())
     _fit(scorer, known, settings, seed)
     return scorer
@@ -141,6 +143,13 @@ def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) 
 
 def _grasps(known: Proposals) -> Grasps:
     return Grasps.build(known.pose, known.joints, 1)
+
+
+def _spread(views: Sequence[int], most: int | None) -> Sequence[int]:
+    """Return at most so many of the views, evenly spread: they follow each other scene by scene."""
+    if most is None or most >= len(views):
+        return views
+    return [views[number * len(views) // most] for number in range(most)]
 
 
 def _choose(

@@ -32,7 +32,9 @@ class TrainerSettings:
     save_every: int = 500
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "shards", "calibrate", "log_every", "validate_every", "save_every"):
+        if self.steps < 0:
+            raise DexgraspError("trainer.steps of at least 0", str(self.steps), "set it; 0: the scorer alone")
+        for name in ("batch", "shards", "calibrate", "log_every", "validate_every", "save_every"):
             if getattr(self, name) < 1:
                 raise DexgraspError(f"trainer.{name} of at least 1", str(getattr(self, name)), f"set trainer.{name}")
         if self.processes is not None and self.processes < 1:
