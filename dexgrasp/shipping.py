@@ -114,6 +114,7 @@ def _card(
     config = OmegaConf.load(run / "config.yaml") if (run / "config.yaml").is_file() else None
     own = _json(run / "results.json") if (run / "results.json").is_file() else {}
     parts = {kind: part["name"] for kind, part in notes["config"].items()}
+    before = _before(config)
     yield f"# {name}"
     yield ""
     yield (
@@ -136,14 +137,38 @@ def _card(
     if overrides.is_file():
         words = [re.sub(r"=/[^\s,\]]+", "=DIR", str(word)) for word in OmegaConf.load(overrides)]
         yield f"- `python -m dexgrasp train {' '.join(words)}`".rstrip("` ") + "`"
+    yield from before["How it was made"]
     yield from ("", "## Data and licences", "")
     yield from _data(config) if isinstance(config, DictConfig) else ["Not known: no config lies beside the weights."]
+    yield from before["Data and licences"]
     yield from ("", "## Figures", "")
     yield from _figures(own, results)
     if config is not None:
         # Where a folder lay on the machine of the training is nobody's business.
         told = re.sub(r"(?m)(: )/\S*/([^/\s]+)$", r"\1.../\2", OmegaConf.to_yaml(config).rstrip())
         yield from ("", "## Config", "", "```yaml", told, "```")
+
+
+def _before(config: Any) -> dict[str, list[str]]:
+    """Return what the card of the shipped weights that a training began with says of how they were made."""
+    told: dict[str, list[str]] = {"How it was made": [], "Data and licences": []}
+    start = None if config is None else config.get("init_from")
+    if start is None:
+        return told
+    card = WEIGHTS / f"{start}.md"
+    if not card.is_file():
+        told["How it was made"] = ["- it began with another training, whose card is its own"]
+        return told
+    for section in card.read_text().split("\n## ")[1:]:
+        title, *lines = section.splitlines()
+        if title in told:
+            told[title] = [
+                "",
+                f"What it began with, `{start}` as shipped before:",
+                "",
+                *[each for each in lines if each],
+            ]
+    return told
 
 
 def _data(config: DictConfig) -> Iterator[str]:

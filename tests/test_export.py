@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 import dexgrasp
 from dexgrasp import checkpoint, shipping
@@ -92,6 +93,20 @@ def test_weights_load_by_name_and_carry_a_card(model, tmp_path, monkeypatch):
         torch.testing.assert_close(value, model.state_dict()[name], atol=1e-3, rtol=1e-3)
     with pytest.raises(DexgraspError, match="did you mean 'tiny'"):
         dexgrasp.load_model("tinny")
+
+
+def test_a_card_tells_what_its_weights_began_with(model, tmp_path, monkeypatch):
+    monkeypatch.setattr(shipping, "WEIGHTS", tmp_path / "weights")
+    for name, start in (("first", None), ("second", "first"), ("third", "elsewhere")):
+        run = tmp_path / name
+        save_model(run / "model.safetensors", model, {"seed": 3, "steps": 7 if start is None else 0})
+        objects = {"kind": "procedural", "split": "train", "seed": 5 if start is None else 6}
+        OmegaConf.save(OmegaConf.create({"init_from": start, "dataset": {"objects": objects}}), run / "config.yaml")
+        shipping.ship(run / "model.safetensors", name, tmp_path / "weights", views=2)
+    first, second, third = ((tmp_path / "weights" / f"{name}.md").read_text() for name in ("first", "second", "third"))
+    assert "began" not in first and "seed 6" not in first
+    assert all(word in second for word in ("0 steps", "7 steps", "seed 5), ", "seed 6), ", "`first` as shipped before"))
+    assert "another training" in third and "seed 5" not in third
 
 
 def test_what_is_not_shipped(model, tmp_path, monkeypatch):
