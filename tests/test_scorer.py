@@ -167,15 +167,6 @@ def test_it_tries_what_it_would_choose_itself(tmp_path, monkeypatch, tiny):
     save_model(path, model)
     twice = scoring.fit_scorer(model, path, dataset, dataclasses.replace(told, rounds=2), 0, 1)
     assert twice.proposals > once.proposals and (twice.chosen is None) == (not dataset.split("validation"))
-    model.scorer = None
-    save_model(path, model)
-    fewer = scoring.fit_scorer(model, path, dataset, dataclasses.replace(told, rounds=2, own_views=1), 0, 1)
-    assert once.proposals < fewer.proposals < twice.proposals
-
-
-def test_views_in_which_its_choice_is_tried_are_spread_over_all():
-    assert scoring._spread(range(10, 100), 3) == [10, 40, 70]
-    assert scoring._spread(range(5), None) == scoring._spread(range(5), 9) == range(5)
 
 
 def test_it_begins_with_the_one_that_a_network_had(tmp_path, monkeypatch, tiny):
@@ -224,7 +215,7 @@ def test_settings_are_checked():
         {"choices": 0},
         {"rounds": 0},
         {"upright": -0.1},
-        {"own_views": 0},
+        {"views": 0},
         {"clear": (0.1, 0.2)},
         {"blocked": (0.1, 0.2, 0.3, 1.5)},
     ):

@@ -31,7 +31,6 @@ class ScorerSettings:
     verdicts: int = 0
     rounds: int = 1
     chosen: int = 2
-    own_views: int | None = None
     protocol: str = "lift-bulk-v1"
     weight: float = 5.0
     views: int | None = None
@@ -47,9 +46,8 @@ class ScorerSettings:
         for name in ("choices", "most", "per_view", "rounds", "chosen", "epochs", "batch"):
             if getattr(self, name) < 1:
                 raise DexgraspError(f"scorer.{name} of at least 1", str(getattr(self, name)), f"set scorer.{name}")
-        for name in ("views", "own_views"):
-            if (most := getattr(self, name)) is not None and most < 1:
-                raise DexgraspError(f"scorer.{name} of at least 1, or null", str(most), f"set scorer.{name}; null: all")
+        if self.views is not None and self.views < 1:
+            raise DexgraspError("scorer.views of at least 1, or null", str(self.views), "set scorer.views; null: all")
         if self.upright < 0 or self.raised < 0:
             found = f"scorer.upright={self.upright}, scorer.raised={self.raised}"
             raise DexgraspError("scorer.upright and scorer.raised of at least 0", found, "set them so; 0: nothing")

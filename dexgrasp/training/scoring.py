@@ -65,8 +65,7 @@ def fit_scorer(
     model.scorer = scorer = _fitted(model, known, settings, seed, start)
     for turn in range(1, settings.rounds):
         told = f"scorer, its own choice {turn}"
-        some = _spread(views, settings.own_views)
-        known = Proposals.cat([known, _choose(model, dataset, some, settings, seed, workers, told)])
+        known = Proposals.cat([known, _choose(model, dataset, views, settings, seed, workers, told)])
         model.scorer = scorer = _fitted(model, known, settings, seed, start)
     area = before = verdicts = own = None
     if unseen := dataset.split("validation"):
@@ -75,8 +74,7 @@ def fit_scorer(
         area, before = roc_area(told_so, rest.holds), roc_area(rest.score, rest.holds)
         verdicts = _reliable(told_so, rest)
         if settings.rounds > 1:
-            some = _spread(unseen, settings.own_views)
-            chosen = _choose(model, dataset, some, settings, seed, workers, "scorer, validation of its choice")
+            chosen = _choose(model, dataset, unseen, settings, seed, workers, "scorer, validation of its choice")
             own = _reliable(_told_by(scorer, chosen), chosen)
             rest = Proposals.cat([rest, chosen])
             told_so = _told_by(scorer, rest)
@@ -143,13 +141,6 @@ def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) 
 
 def _grasps(known: Proposals) -> Grasps:
     return Grasps.build(known.pose, known.joints, 1)
-
-
-def _spread(views: Sequence[int], most: int | None) -> Sequence[int]:
-    """Return at most so many of the views, evenly spread: they follow each other scene by scene."""
-    if most is None or most >= len(views):
-        return views
-    return [views[number * len(views) // most] for number in range(most)]
 
 
 def _choose(
