@@ -33,10 +33,11 @@ from dexgrasp.dataset import normals
 from dexgrasp.geometry import inverse
 from dexgrasp.level import carried, level_frame
 from dexgrasp.model import GraspNet, build_model
-from dexgrasp.scorer import COARSE, Scorer, surroundings
+from dexgrasp.scorer import Scorer
 from dexgrasp.selection import select
 from dexgrasp.table import find_table
 from dexgrasp.testing.views import seen_scenes
+from dexgrasp.training.scorer_settings import ScorerSettings
 
 LIMITS = {8192: 60.0, 20000: 150.0}
 """What a prediction may take, ms."""
@@ -49,7 +50,7 @@ def default_model() -> GraspNet:
         composed = compose("train")
     torch.manual_seed(0)
     model = build_model(composed)
-    model.scorer = Scorer(model.hand, model.backbone.channels, choices=composed.scorer.choices)
+    model.scorer = Scorer(model.hand, model.backbone.channels, tips=ScorerSettings().tips)
     return model.eval()
 
 
@@ -83,8 +84,7 @@ def stages(model: GraspNet, points: np.ndarray) -> dict[str, float]:
     lap("heads, decoding")
     if judge is not None:
         answers = len(told) // len(rows)
-        near = surroundings(model.hand, told, level[seeds[:COARSE]])
-        score = judge(rows, level[chosen].repeat(answers, 1), told, near)
+        score = judge(rows, level[chosen].repeat(answers, 1), told, *judge.look(told, level[seeds[: judge.spread]]))
         told = told.replace(quality=score.sigmoid())
         lap("scorer")
     grasps = told.moved(inverse(level_T_camera))

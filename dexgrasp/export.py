@@ -22,7 +22,6 @@ from dexgrasp.checkpoint import plain, replace_file
 from dexgrasp.errors import DexgraspError
 from dexgrasp.model import GraspNet
 from dexgrasp.sampling import farthest_points
-from dexgrasp.scorer import COARSE
 
 GRASPS = {
     "pose": "(R, 4, 4) cloud_T_base of each of R grasps, m",
@@ -62,7 +61,7 @@ def indices(model: GraspNet, cloud: Float[Tensor, "N 6"], kind: str) -> dict[str
     """Return all inputs of the graph but the cloud itself: the backbone's plan, int64; for a scorer, `coarse` too."""
     found = {name: value.long() for name, value in model.backbone.plan(cloud[:, :3]).items()}
     if kind == "grasps" and model.scorer is not None:
-        found["coarse"] = farthest_points(cloud[:, :3], min(COARSE, len(cloud)))
+        found["coarse"] = farthest_points(cloud[:, :3], min(model.scorer.spread, len(cloud)))
     return found
 
 
@@ -121,7 +120,7 @@ def trace(model: GraspNet, cloud: Float[Tensor, "N 6"], kind: str) -> Graph:
     """Return the graph, for clouds with more points than the network has seeds; `cloud` is any of these."""
     given = indices(model, cloud, kind)
     network = Exported(model, kind, tuple(given))
-    fewest = max(len(given["seeds"]), COARSE) + 1
+    fewest = max(len(given["seeds"]), len(given.get("coarse", ()))) + 1
     if len(cloud) < fewest:
         raise DexgraspError(f"a cloud of at least {fewest} points", str(len(cloud)), "trace with a larger one")
     shapes: Any = ({0: torch.export.Dim("points", min=fewest, max=MOST_POINTS)}, tuple({} for _ in given))
@@ -146,7 +145,7 @@ def describe(model: GraspNet, kind: str) -> dict[str, Any]:
         "outputs": outputs,
         "dtype": str(next(model.parameters()).dtype).removeprefix("torch."),
         "points": model.points,
-        "coarse": COARSE if kind == "grasps" and model.scorer is not None else 0,
+        "coarse": model.scorer.spread if kind == "grasps" and model.scorer is not None else 0,
         "backbone": plain(model.config["backbone"]),
         "representation": plain(model.config["repr"]),
         "hand": hand.name,

@@ -32,7 +32,7 @@ from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.level import carried, level_frame
 from dexgrasp.representation import Prediction, Representation, Targets
-from dexgrasp.scorer import COARSE, Scorer, coarse_points, surroundings
+from dexgrasp.scorer import Scorer, coarse_points
 from dexgrasp.selection import Selection, select
 from dexgrasp.table import find_table
 
@@ -146,11 +146,11 @@ class GraspNet(nn.Module):
         scorer = self.scorer.eval() if self.scorer.training else self.scorer
         features, seeds, grasps, every = self._told(cloud, plan, scorer.choices, scorer.most)
         answers = len(grasps) // len(seeds)
-        if coarse is None and self.backbone.farthest_first and len(every) >= min(COARSE, len(cloud)):
-            coarse = every[:COARSE]
-        spread = coarse_points(cloud) if coarse is None else cloud[coarse]
+        if coarse is None and self.backbone.farthest_first and len(every) >= min(scorer.spread, len(cloud)):
+            coarse = every[: scorer.spread]
+        spread = coarse_points(cloud, scorer.spread) if coarse is None else cloud[coarse]
         at = cloud[seeds].repeat(answers, 1)
-        return grasps.replace(quality=scorer(features, at, grasps, surroundings(self.hand, grasps, spread)).sigmoid())
+        return grasps.replace(quality=scorer(features, at, grasps, *scorer.look(grasps, spread)).sigmoid())
 
     def predict(
         self,

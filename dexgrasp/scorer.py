@@ -1,6 +1,6 @@
 """How likely a proposed grasp is to lift: a second opinion on what the representation's heads have told."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,19 +12,23 @@ from torch import Tensor, nn
 from dexgrasp.geometry import transform
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
-from dexgrasp.heads import mlp
+from dexgrasp.heads import Layers, mlp
 from dexgrasp.sampling import farthest_points
 
 COARSE, NEAREST = 512, 64
 """Of so many points, spread evenly over the scene, a grasp is judged by the ones nearest to the middle of its tips."""
+FINE, AT_TIP = 2048, 16
+"""And of so many by the ones nearest to each fingertip."""
 PIECE = 32
 """Hands whose surroundings are looked at together in evaluation."""
-REACH = 0.1
-"""Offsets and heights (m) in units of this are numbers of order one."""
+REACH, TIP_REACH = 0.1, 0.03
+"""Offsets and heights (m) in units of this are numbers of order one; about a fingertip, of the other."""
 
 
 class Scorer(nn.Module):
     """Logit of the probability that a grasp lifts, from the point's feature, the grasp, and what lies about the hand.
+
+    Whether it lifts is decided where fingertips meet the object: each sees the points about it in its own frame.
 
     Labels say which points some known grasp touches; they do not say whether what the network tells there is any good.
     This is trained on exactly that: on the network's own grasps, closed on the true objects.
@@ -36,6 +40,8 @@ class Scorer(nn.Module):
         most: number of points, the most graspable as the heads think, whose grasps it looks at.
         hidden: widths of the hidden layers.
         around: widths of the layers on each point about the hand, whose maximum is then taken (PointNet).
+        tips: widths of the layers on each point about a fingertip, whose maximum and mean are then taken; none: it does
+            not look there.
         upright: what was done to the grasps whose outcome it has learnt, see `dexgrasp.selection.Selection`, rad.
         raised: likewise, m.
     """
@@ -48,6 +54,7 @@ class Scorer(nn.Module):
         most: int = 256,
         hidden: Sequence[int] = (256, 128),
         around: Sequence[int] = (32, 64),
+        tips: Sequence[int] = (),
         upright: float = 0.0,
         raised: float = 0.0,
     ) -> None:
@@ -58,11 +65,24 @@ class Scorer(nn.Module):
             "most": most,
             "hidden": list(hidden),
             "around": list(around),
+            "tips": list(tips),
             "upright": upright,
             "raised": raised,
         }
         self.around = mlp(7, around[:-1], around[-1])
-        self.layers = mlp(channels + around[-1] + 13 + len(hand.joint_names), hidden, 1)
+        self.tips = mlp(7, tips[:-1], tips[-1]) if tips else None
+        self.tip = nn.Sequential(nn.Linear(2 * tips[-1], tips[-1]), nn.ReLU()) if tips else None
+        self.spread = FINE if tips else COARSE
+        """Number of `coarse_points` at which it looks."""
+        felt = len(hand.fingers) * tips[-1] if tips else 0
+        self.layers = mlp(channels + around[-1] + felt + 13 + len(hand.joint_names), hidden, 1)
+
+    def look(
+        self, grasps: Grasps, points: Float[Tensor, "Q 6"]
+    ) -> tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F T 7"]]:
+        """Return what it sees about hands and fingertips of a scene's `coarse_points`, `self.spread` of them."""
+        tips = at_tips(self.hand, grasps, points, AT_TIP if self.tips is not None else 0)
+        return surroundings(self.hand, grasps, points[:COARSE]), tips
 
     def forward(
         self,
@@ -70,22 +90,31 @@ class Scorer(nn.Module):
         at: Float[Tensor, "N 6"],
         grasps: Grasps,
         around: Float[Tensor, "N K 7"],
+        tips: Float[Tensor, "N F T 7"],
     ) -> Float[Tensor, "N"]:
-        """Return N logits; `at` is point (m) and normal where each grasp is told, level frame; `around` see below.
+        """Return N logits; `at` is point (m) and normal where each grasp is told, level frame; the rest is of `look`.
 
         Features of M points, of each of which N / M answers are judged: all points' first, all points' second, ...
         """
         offset = (grasps.pose[:, :3, 3] - at[:, :3]) / REACH
         turned = grasps.pose[:, :3, :2].flatten(1)
-        each, rows = around.shape[1], around.to(features).flatten(0, 1)
-        if self.training or torch.compiler.is_compiling() or rows.device.type != "cpu":
-            near = self.around(rows).unflatten(0, (-1, each)).amax(dim=1)
-        else:
-            pieces = self.around.in_pieces(rows.split(PIECE * each))  # that stay in the cache
-            near = torch.cat([piece.unflatten(0, (-1, each)).amax(dim=1) for piece in pieces])
+        near = torch.cat([piece.amax(dim=1) for piece in self._pieces(self.around, around.to(features))])
         seen = [near, offset, turned, at[:, 3:], at[:, 2:3] / REACH, grasps.joints]
+        if self.tips is not None and self.tip is not None:
+            pieces = self._pieces(self.tips, tips.to(features).flatten(0, 1))
+            felt = torch.cat([torch.cat([piece.amax(dim=1), piece.mean(dim=1)], dim=1) for piece in pieces])
+            seen.append(self.tip(felt).unflatten(0, (-1, tips.shape[1])).flatten(1))
         own = torch.cat([part.to(features) for part in seen], dim=1)
         return self.layers(features, own).squeeze(1)
+
+    def _pieces(self, layers: Layers, rows: Float[Tensor, "N K 7"]) -> Iterator[Float[Tensor, "_ K D"]]:
+        """Yield what layers make of the points about each of N places, piece by piece where that is quicker."""
+        each, every = rows.shape[1], rows.flatten(0, 1)
+        if self.training or torch.compiler.is_compiling() or rows.device.type != "cpu":
+            pieces = iter([layers(every)])
+        else:
+            pieces = layers.in_pieces(every.split(max(PIECE * NEAREST // each, 1) * each))  # that stay in the cache
+        return (piece.unflatten(0, (-1, each)) for piece in pieces)
 
     @torch.no_grad()
     def calibrate(self, logits: Float[Tensor, "N"], came: Float[Tensor, "N"]) -> None:
@@ -129,33 +158,56 @@ def surroundings(hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"]) -> Fl
     points = points.to(grasps.pose)
     middle = transform(grasps.pose, hand.fingertips(grasps.joints)[..., :3, 3].mean(dim=1).to(grasps.pose))
     palm = grasps.pose @ hand.base_T_palm.to(grasps.pose)
-    count = min(NEAREST, len(points))
-    compiled = palm.device.type == "cpu" and palm.dtype == torch.float32 and not torch.compiler.is_compiling()
-    return (_compiled if compiled and not palm.requires_grad else around_reference)(middle, palm, points, count)
+    return _seen(middle, palm, points, NEAREST, REACH)
+
+
+def at_tips(hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"], count: int = AT_TIP) -> Float[Tensor, "N F T 7"]:
+    """Return the `count` points nearest to each fingertip's centre, in its frame (`Hand.fingertips`), scaled.
+
+    Position, normal and height in the level frame, in no particular order.
+    """
+    tips = grasps.pose[:, None] @ hand.fingertips(grasps.joints).to(grasps.pose)
+    if not count:
+        return tips.new_zeros(*tips.shape[:2], 0, 7)
+    every = tips.flatten(0, 1)
+    return _seen(every[:, :3, 3], every, points.to(tips), count, TIP_REACH).unflatten(0, tips.shape[:2])
+
+
+def _seen(
+    middle: Float[Tensor, "N 3"], frame: Float[Tensor, "N 4 4"], points: Float[Tensor, "Q 6"], count: int, reach: float
+) -> Float[Tensor, "N K 7"]:
+    count = min(count, len(points))
+    compiled = frame.device.type == "cpu" and frame.dtype == torch.float32 and not torch.compiler.is_compiling()
+    quick = compiled and not frame.requires_grad
+    return (_compiled if quick else around_reference)(middle, frame, points, count, reach)
 
 
 def around_reference(
-    middle: Float[Tensor, "N 3"], palm: Float[Tensor, "N 4 4"], points: Float[Tensor, "Q 6"], count: int
+    middle: Float[Tensor, "N 3"],
+    frame: Float[Tensor, "N 4 4"],
+    points: Float[Tensor, "Q 6"],
+    count: int,
+    reach: float = REACH,
 ) -> Float[Tensor, "N K 7"]:
-    """Return the `count` points nearest to each `middle`, in the palm's frame and scaled, in plain torch."""
+    """Return the `count` points nearest to each `middle`, in a frame of each and over `reach` (m), in plain torch."""
     apart = middle[:, None] - points[:, :3]
     nearest = apart.square().sum(dim=-1).topk(count, largest=False).indices
     positions, normals = points[nearest].split(3, dim=-1)
-    local = (positions - palm[:, None, :3, 3]) @ palm[:, :3, :3] / REACH
-    return torch.cat([local, normals @ palm[:, :3, :3], positions[..., 2:] / REACH], dim=-1)
+    local = (positions - frame[:, None, :3, 3]) @ frame[:, :3, :3] / reach
+    return torch.cat([local, normals @ frame[:, :3, :3], positions[..., 2:] / reach], dim=-1)
 
 
 def _compiled(
-    middle: Float[Tensor, "N 3"], palm: Float[Tensor, "N 4 4"], points: Float[Tensor, "Q 6"], count: int
+    middle: Float[Tensor, "N 3"], frame: Float[Tensor, "N 4 4"], points: Float[Tensor, "Q 6"], count: int, reach: float
 ) -> Float[Tensor, "N K 7"]:
     out = torch.empty(len(middle), count, 7)
-    one, other, third = (part.detach().contiguous().numpy() for part in (middle, palm, points))
-    _around(one, other, third, np.float32(1 / REACH), out.numpy())
+    one, other, third = (part.detach().contiguous().numpy() for part in (middle, frame, points))
+    _around(one, other, third, np.float32(1 / reach), out.numpy())
     return out
 
 
 @njit(cache=True)
-def _around(middle: np.ndarray, palm: np.ndarray, points: np.ndarray, scale: np.float32, out: np.ndarray) -> None:
+def _around(middle: np.ndarray, frame: np.ndarray, points: np.ndarray, scale: np.float32, out: np.ndarray) -> None:
     count, total = out.shape[1], len(points)
     x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
     apart = np.empty(total, np.float32)
@@ -182,7 +234,7 @@ def _around(middle: np.ndarray, palm: np.ndarray, points: np.ndarray, scale: np.
         room = count  # for points at the very limit: as many as nearer ones leave
         for k in range(total):
             room -= apart[k] < limit
-        r, n = palm[i], 0
+        r, n = frame[i], 0
         for k in range(total):
             if apart[k] > limit or (apart[k] == limit and room == 0):
                 continue

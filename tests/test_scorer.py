@@ -15,7 +15,18 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import axis_angle, pose, rotate, transform
 from dexgrasp.grasps import Grasps
 from dexgrasp.model import GraspNet, build_model, load_model, save_model
-from dexgrasp.scorer import COARSE, NEAREST, Scorer, around_reference, coarse_points, platt, surroundings
+from dexgrasp.scorer import (
+    AT_TIP,
+    COARSE,
+    FINE,
+    NEAREST,
+    Scorer,
+    around_reference,
+    at_tips,
+    coarse_points,
+    platt,
+    surroundings,
+)
 from dexgrasp.selection import Selection
 from dexgrasp.statistics import roc_area
 from dexgrasp.table import find_table
@@ -79,6 +90,53 @@ def test_a_scene_turned_about_the_vertical_looks_the_same_to_the_hand(hand):
     moved = torch.cat([points[:, :3] @ rotation + turn[:3, 3], points[:, 3:] @ rotation], dim=1)
     here, there = surroundings(hand, grasps, points), surroundings(hand, grasps.moved(turn), moved)
     assert torch.cdist(here.double(), there.double()).amin(dim=2).max() < 1e-4
+
+
+def test_fingertips_see_the_points_nearest_to_them_in_their_own_frames(hand):
+    grasps, points = some(hand), coarse_points(cloud(3000), FINE)
+    seen_there = at_tips(hand, grasps, points)
+    assert seen_there.shape == (5, len(hand.fingers), AT_TIP, 7)
+    for row in range(5):
+        for finger in range(len(hand.fingers)):
+            tip = (grasps.pose[row] @ hand.fingertips(grasps.joints[row : row + 1])[0, finger].float()).double()
+            nearest = (points[:, :3] - tip[:3, 3]).norm(dim=1).argsort()[:AT_TIP]
+            local = (torch.linalg.inv(tip)[:3, :3] @ (points[nearest, :3].double() - tip[:3, 3]).T).T / 0.03
+            normals = (torch.linalg.inv(tip)[:3, :3] @ points[nearest, 3:].double().T).T
+            expected = torch.cat([local, normals, points[nearest, 2:3].double() / 0.03], dim=1)
+            found = seen_there[row, finger].double()
+            matched = torch.cdist(expected, found).argmin(dim=1)
+            assert len(matched.unique()) == AT_TIP
+            torch.testing.assert_close(found[matched], expected, atol=1e-3, rtol=0)
+    assert at_tips(hand, grasps, points, 0).shape == (5, len(hand.fingers), 0, 7)
+    assert at_tips(hand, grasps, points[:7]).shape == (5, len(hand.fingers), 7, 7)
+
+
+def test_a_scorer_tells_by_what_is_at_its_fingertips(hand):
+    """In pieces in evaluation as all at once in training's way; what is far from the tips changes nothing there."""
+    torch.manual_seed(0)
+    scorer, grasps, points = Scorer(hand, 8, tips=(16, 24)).eval(), some(hand, 300), coarse_points(cloud(3000), FINE)
+    given = torch.randn(300, 8), torch.randn(300, 6), grasps
+    around, tips = scorer.look(grasps, points)
+    told = scorer(*given, around, tips)
+    with torch.no_grad():
+        whole = scorer.tips(tips.flatten(0, 2)).unflatten(0, (-1, AT_TIP))
+        felt = scorer.tip(torch.cat([whole.amax(dim=1), whole.mean(dim=1)], dim=1)).unflatten(0, (300, -1)).flatten(1)
+        near = scorer.around(around.flatten(0, 1)).unflatten(0, (300, -1)).amax(dim=1)
+        offset = (grasps.pose[:, :3, 3] - given[1][:, :3]) / 0.1
+        own = [
+            near,
+            offset,
+            grasps.pose[:, :3, :2].flatten(1),
+            given[1][:, 3:],
+            given[1][:, 2:3] / 0.1,
+            grasps.joints,
+            felt,
+        ]
+        expected = scorer.layers(torch.cat([given[0], *own], dim=1)).squeeze(1)
+    torch.testing.assert_close(told, expected, atol=1e-5, rtol=1e-5)
+    assert not torch.allclose(scorer(*given, around, tips.flip(0)), told)
+    blind = Scorer(hand, 8)
+    assert blind.spread == COARSE and scorer.spread == FINE and blind.look(grasps, points)[1].shape[2] == 0
 
 
 def test_few_points_are_enough(hand):
@@ -161,8 +219,10 @@ def test_it_tries_what_it_would_choose_itself(tmp_path, monkeypatch, tiny):
         assert 1 <= len(part) <= len(seen[seen >= 0].unique()) and not part.lifted.isnan().any()
         with torch.no_grad():
             rest = proposals.propose(path, dataset, [view], told, 0, 1, "some")
-            best = model.scorer(part.features, part.at, scoring._grasps(part), part.around).max()
-            assert best >= model.scorer(rest.features, rest.at, scoring._grasps(rest), rest.around).max() - 1e-4
+            best = model.scorer(part.features, part.at, scoring._grasps(part), part.around, part.tips).max()
+            assert (
+                best >= model.scorer(rest.features, rest.at, scoring._grasps(rest), rest.around, rest.tips).max() - 1e-4
+            )
     model.scorer = None
     save_model(path, model)
     twice = scoring.fit_scorer(model, path, dataset, dataclasses.replace(told, rounds=2), 0, 1)
@@ -243,7 +303,7 @@ def test_calibration_makes_probabilities_come_true_and_keeps_the_order(hand):
         slope, shift = platt(logits[:50], all_alike)
         assert slope > 0 and math.isfinite(shift)
     scorer, grasps = Scorer(hand, 8).eval(), some(hand, 64)
-    given = torch.randn(64, 8), torch.randn(64, 6), grasps, torch.randn(64, NEAREST, 7)
+    given = torch.randn(64, 8), torch.randn(64, 6), grasps, *scorer.look(grasps, coarse_points(cloud()))
     before = scorer(*given).detach()
     came = torch.bernoulli((before - before.mean()).sigmoid())
     slope, shift = platt(before, came)

@@ -20,7 +20,7 @@ from dexgrasp.level import levelled
 from dexgrasp.model import GraspNet, load_model
 from dexgrasp.progress import track
 from dexgrasp.scene import View
-from dexgrasp.scorer import COARSE, coarse_points, surroundings
+from dexgrasp.scorer import AT_TIP, COARSE, FINE, at_tips, coarse_points, surroundings
 from dexgrasp.seeds import stream
 from dexgrasp.selection import free, on_table, select
 from dexgrasp.simulation.protocol import load_protocol
@@ -29,7 +29,7 @@ from dexgrasp.training.scorer_settings import ScorerSettings
 
 DRAWN = 3
 """So many times the grasps wanted of a view are drawn: most meet what the camera sees."""
-SPREAD = 2048
+SPREAD = FINE
 """Points of a view of which none may lie in the open hand: fewer than in prediction, to save time."""
 LEVEL = torch.eye(4, dtype=torch.float64)
 """The table in the level frame."""
@@ -47,6 +47,8 @@ class Proposals(Batch):
     joints: Float[Tensor, "N J"]
     around: Float[Tensor, "N K 7"]
     """What lies about the hand, see `dexgrasp.scorer.surroundings`; half precision."""
+    tips: Float[Tensor, "N F T 7"]
+    """What lies about its fingertips, see `dexgrasp.scorer.at_tips`; half precision."""
     score: Float[Tensor, "N"]
     """Probability of graspable as the heads tell it."""
     worth: Float[Tensor, "N"]
@@ -96,9 +98,9 @@ def _of_view(
     done = on_table(hand, dataset.shape, grasps, LEVEL, set_up)
     coarse = coarse_points(cloud, SPREAD)
     if own:
-        at, around = cloud[seeds].repeat(len(told), 1), surroundings(hand, grasps, coarse[:COARSE])
         assert model.scorer is not None
-        score = model.scorer(features, at, grasps, around)
+        at = cloud[seeds].repeat(len(told), 1)
+        score = model.scorer(features, at, grasps, *model.scorer.look(grasps, coarse))
         rows = _best(model, done.replace(quality=score.sigmoid()), coarse, settings)
     else:
         order = torch.from_numpy(stream(seed, "proposals", index).permutation(len(grasps)))
@@ -112,10 +114,11 @@ def _of_view(
     worth = torch.where(found.clear, torch.tensor(settings.clear)[kind], torch.tensor(settings.blocked)[kind])
     holds = found.clear & (found.capacity >= max(truth.settings.capacity, 1.0))
     around = surroundings(hand, grasps, coarse[:COARSE]).half()
+    tips = at_tips(hand, grasps, coarse, AT_TIP if settings.tips else 0).half()
     lifted = torch.full_like(worth, torch.nan)
     tried = len(grasps) if own else settings.verdicts
     lifted[:tried] = _executed(dataset, view, done[:tried], index, settings.protocol)
-    told_by = features[at], cloud[seeds[at]], grasps.pose, grasps.joints, around, grasps.quality
+    told_by = features[at], cloud[seeds[at]], grasps.pose, grasps.joints, around, tips, grasps.quality
     return Proposals(*told_by, worth, lifted, holds)
 
 

@@ -11,7 +11,7 @@ from dexgrasp.scorer import Scorer
 from dexgrasp.settings import read
 from dexgrasp.simulation.protocol import load_protocol
 
-FROM_START = ("most", "choices", "hidden", "around", "upright", "raised")
+FROM_START = ("most", "choices", "hidden", "around", "tips", "upright", "raised")
 """What, left open, is as the scorer has it that one begins with."""
 
 
@@ -25,6 +25,7 @@ class ScorerSettings:
     most: int = 256
     hidden: tuple[int, ...] = (256, 128)
     around: tuple[int, ...] = (32, 64)
+    tips: tuple[int, ...] = (32, 32)
     upright: float = 0.0
     raised: float = 0.0
     per_view: int = 200

@@ -88,7 +88,7 @@ def fit_scorer(
 @one_thread()
 @torch.no_grad()
 def _told_by(scorer: Scorer, known: Proposals) -> Float[Tensor, "N"]:
-    return scorer(known.features, known.at, _grasps(known), known.around)
+    return scorer(known.features, known.at, _grasps(known), known.around, known.tips)
 
 
 def _reliable(told: Float[Tensor, "N"], known: Proposals) -> dict[str, Any] | None:
@@ -102,7 +102,7 @@ def _fitted(
 ) -> Scorer:
     """Return a scorer that has learnt what is known, from `start` where it is of the same size."""
     torch.manual_seed(int(stream(seed, "scorer").integers(2**31)))
-    shape = settings.choices, settings.most, settings.hidden, settings.around
+    shape = settings.choices, settings.most, settings.hidden, settings.around, settings.tips
     options = *shape, settings.upright, settings.raised
     scorer = Scorer(model.hand, known.features.shape[1], *options)
     if start is not None and not settings.anew and _sizes(start) == _sizes(scorer):
@@ -127,7 +127,7 @@ def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) 
         shuffled = torch.randperm(len(known), generator=order)
         for start in range(0, len(known) - size + 1, size):
             rows = known[shuffled[start : start + size]]
-            logits = scorer(rows.features, rows.at, _grasps(rows), rows.around)
+            logits = scorer(rows.features, rows.at, _grasps(rows), rows.around, rows.tips)
             tried = ~rows.lifted.isnan()
             wanted = torch.where(tried, rows.lifted, rows.worth)
             weight = torch.where(tried, settings.weight, 1.0)
