@@ -120,7 +120,8 @@ def trace(model: GraspNet, cloud: Float[Tensor, "N 6"], kind: str) -> Graph:
     """Return the graph, for clouds with more points than the network has seeds; `cloud` is any of these."""
     given = indices(model, cloud, kind)
     network = Exported(model, kind, tuple(given))
-    fewest = max(len(given["seeds"]), len(given.get("coarse", ()))) + 1
+    spread = model.scorer.spread if "coarse" in given and model.scorer is not None else 0
+    fewest = max(len(given["seeds"]), spread) + 1
     if len(cloud) < fewest:
         raise DexgraspError(f"a cloud of at least {fewest} points", str(len(cloud)), "trace with a larger one")
     shapes: Any = ({0: torch.export.Dim("points", min=fewest, max=MOST_POINTS)}, tuple({} for _ in given))

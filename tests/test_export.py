@@ -64,6 +64,20 @@ def test_a_graph_says_what_the_network_says(model, tmp_path, kind, suffix):
     assert worse.beyond == worse.rows
 
 
+def test_a_scorer_that_looks_at_fingertips_is_exported(model, tmp_path):
+    wide = copy.deepcopy(model)
+    wide.points = 2600
+    wide.scorer = Scorer(wide.hand, wide.backbone.channels, choices=1, most=100, tips=(8, 8)).eval()
+    views = [view[: 2300 + 100 * number] for number, view in enumerate(level_views(wide, 2))]
+    graph = trace(wide, views[0], "grasps")
+    assert graph.about["coarse"] == wide.scorer.spread == 2048
+    graph.write(tmp_path / "grasps.pt2")
+    found = compare(wide, "grasps", runner(tmp_path / "grasps.pt2", graph.inputs), views, 1e-5)
+    assert found.rows == 200 and found.beyond <= 2, found
+    with pytest.raises(DexgraspError, match="2049 points"):
+        trace(wide, views[0][:2000], "grasps")
+
+
 def test_in_double_precision_no_choice_falls_otherwise(model, tmp_path):
     double = copy.deepcopy(model).double()
     views = [view[:900].double() for view in level_views(model, 2)]
