@@ -21,6 +21,8 @@ FINE, AT_TIP = 2048, 16
 """And of so many by the ones nearest to each fingertip."""
 PIECE = 32
 """Hands whose surroundings are looked at together in evaluation."""
+BLOCK = 32
+"""Points that are passed over together where none of them is near."""
 REACH, TIP_REACH = 0.1, 0.03
 """Offsets and heights (m) in units of this are numbers of order one; about a fingertip, of the other."""
 
@@ -210,39 +212,55 @@ def _compiled(
 def _around(middle: np.ndarray, frame: np.ndarray, points: np.ndarray, scale: np.float32, out: np.ndarray) -> None:
     count, total = out.shape[1], len(points)
     x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
-    apart = np.empty(total, np.float32)
+    apart, last = np.empty(total, np.float32), np.float32(1e-3)
+    zero, half, top = np.float32(0), np.float32(0.5), np.float32(np.inf)
     for i in range(len(middle)):
         a, b, c = middle[i]
         for k in range(total):
             u, v, w = x[k] - a, y[k] - b, z[k] - c
             apart[k] = u * u + v * v + w * w
-        # The limit within which `count` lie, by bisection: counting is quick, and a few steps are enough.
-        below, limit = np.float32(-1), apart.max()
-        while True:
-            middle_way = np.float32((below + limit) / 2)
-            if middle_way <= below or middle_way >= limit:
-                break
-            inside = 0
+        # The limit within which `count` lie. Counting is quick, and a few guesses are enough: that of the place before,
+        # then as if points lay on a plane, and the middle where that does not lead on.
+        below, limit, inside, guess, turns = np.float32(-1), top, total, last, 0
+        while inside != count:
+            if not (below < guess < limit):
+                guess = half * (max(below, zero) + limit)
+                if not (below < guess < limit):
+                    break  # neighbouring numbers: several points lie at the very limit
+            found = 0
             for k in range(total):
-                inside += apart[k] <= middle_way
-            if inside < count:
-                below = middle_way
+                found += apart[k] <= guess
+            if found < count:
+                below = guess
             else:
-                limit = middle_way
-            if inside == count:
-                break
+                limit, inside = guess, found
+            turns += 1
+            if limit == top:
+                guess = np.float32(4) * guess
+            elif turns < 8:
+                guess = limit * np.float32(count + 0.5) / np.float32(inside + 0.5)
+            else:
+                guess = half * (max(below, zero) + limit)
+        last = limit if zero < limit < top else last
         room = count  # for points at the very limit: as many as nearer ones leave
         for k in range(total):
             room -= apart[k] < limit
         r, n = frame[i], 0
-        for k in range(total):
-            if apart[k] > limit or (apart[k] == limit and room == 0):
+        for start in range(0, total, BLOCK):
+            stop, some = min(start + BLOCK, total), 0
+            for k in range(start, stop):
+                some += apart[k] <= limit
+            if some == 0:
                 continue
-            room -= apart[k] == limit
-            u, v, w = x[k] - r[0, 3], y[k] - r[1, 3], z[k] - r[2, 3]
-            p, q, s = points[k, 3], points[k, 4], points[k, 5]
-            for axis in range(3):
-                out[i, n, axis] = (u * r[0, axis] + v * r[1, axis] + w * r[2, axis]) * scale
-                out[i, n, 3 + axis] = p * r[0, axis] + q * r[1, axis] + s * r[2, axis]
-            out[i, n, 6] = z[k] * scale
-            n += 1
+            for k in range(start, stop):
+                if not apart[k] <= limit or (apart[k] == limit and room == 0) or n == count:
+                    continue
+                room -= apart[k] == limit
+                u, v, w = x[k] - r[0, 3], y[k] - r[1, 3], z[k] - r[2, 3]
+                p, q, s = points[k, 3], points[k, 4], points[k, 5]
+                for axis in range(3):
+                    out[i, n, axis] = (u * r[0, axis] + v * r[1, axis] + w * r[2, axis]) * scale
+                    out[i, n, 3 + axis] = p * r[0, axis] + q * r[1, axis] + s * r[2, axis]
+                out[i, n, 6] = z[k] * scale
+                n += 1
+        out[i, n:] = np.nan  # of a place that is none
