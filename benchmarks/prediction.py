@@ -37,7 +37,6 @@ from dexgrasp.scorer import Scorer
 from dexgrasp.selection import select
 from dexgrasp.table import find_table
 from dexgrasp.testing.views import seen_scenes
-from dexgrasp.training.scorer_settings import ScorerSettings
 
 LIMITS = {8192: 60.0, 20000: 150.0}
 """What a prediction may take, ms."""
@@ -50,7 +49,7 @@ def default_model() -> GraspNet:
         composed = compose("train")
     torch.manual_seed(0)
     model = build_model(composed)
-    model.scorer = Scorer(model.hand, model.backbone.channels, tips=ScorerSettings().tips)
+    model.scorer = Scorer(model.hand, model.backbone.channels)
     return model.eval()
 
 

@@ -25,7 +25,7 @@ class ScorerSettings:
     most: int = 256
     hidden: tuple[int, ...] = (256, 128)
     around: tuple[int, ...] = (32, 64)
-    tips: tuple[int, ...] = (32, 32)
+    tips: tuple[int, ...] = ()
     upright: float = 0.0
     raised: float = 0.0
     per_view: int = 200
