@@ -112,7 +112,7 @@ def test_fingertips_see_the_points_nearest_to_them_in_their_own_frames(hand):
 
 
 def test_a_scorer_tells_by_what_is_at_its_fingertips(hand):
-    """In pieces in evaluation as all at once in training's way; what is far from the tips changes nothing there."""
+    """In pieces in evaluation as all at once in training's way; it tells otherwise where other points are there."""
     torch.manual_seed(0)
     scorer, grasps, points = Scorer(hand, 8, tips=(16, 24)).eval(), some(hand, 300), coarse_points(cloud(3000), FINE)
     given = torch.randn(300, 8), torch.randn(300, 6), grasps
