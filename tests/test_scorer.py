@@ -229,6 +229,29 @@ def test_it_tries_what_it_would_choose_itself(tmp_path, monkeypatch, tiny):
     assert twice.proposals > once.proposals and (twice.chosen is None) == (not dataset.split("validation"))
 
 
+def test_verdicts_judge_what_was_not_tried(tmp_path, monkeypatch, tiny, capsys):
+    """With few verdicts what a grasp holds decides; with enough, what a surrogate of physics has learnt of them."""
+    monkeypatch.setattr(proposals, "free", lambda hand, shape, grasps, *_: torch.ones(len(grasps), dtype=torch.bool))
+    dataset, model = tiny[1], network(2048)
+    save_model(path := tmp_path / "model.safetensors", model)
+    told = ScorerSettings(choices=2, most=200, per_view=60, epochs=1, batch=32, verdicts=20, surrogate=True)
+    known = proposals.propose(path, dataset, dataset.split("train"), told, 0, 1, "some")
+    assert known.facts.isfinite().all()
+    same, none = scoring._foretold(known, told, 0)
+    assert "of 200 for a surrogate" in capsys.readouterr().err
+    assert none is None and torch.equal(same.worth, known.worth)
+    monkeypatch.setattr(scoring, "FEWEST", 10)
+    off, none = scoring._foretold(known, dataclasses.replace(told, surrogate=False), 0)
+    assert none is None and torch.equal(off.worth, known.worth)
+    taught, surrogate = scoring._foretold(known, told, 0)
+    assert surrogate is not None and not torch.equal(taught.worth, known.worth)
+    tried = ~known.lifted.isnan()
+    before = (known.worth - known.lifted)[tried].square().mean()
+    assert (taught.worth - known.lifted)[tried].square().mean() < before
+    summary = scoring.fit_scorer(model, path, dataset, told, 0, 1)
+    assert 0 < summary.promise < 1 and summary.surrogate["trials"] > 0
+
+
 def test_it_begins_with_the_one_that_a_network_had(tmp_path, monkeypatch, tiny):
     monkeypatch.setattr(proposals, "free", lambda hand, shape, grasps, *_: torch.ones(len(grasps), dtype=torch.bool))
     dataset, model = tiny[1], network(2048)
@@ -281,6 +304,8 @@ def test_settings_are_checked():
     ):
         with pytest.raises(DexgraspError, match=f"scorer.{next(iter(change))}"):
             ScorerSettings(**change)
+    with pytest.raises(DexgraspError, match=r"scorer\.verdicts"):
+        ScorerSettings(surrogate=True)
 
 
 def test_roc_area():

@@ -61,10 +61,23 @@ class Outcome(Batch):
     """Of table and neighbours, on the whole way in."""
     touched: Int[Tensor, "N"]
     """Number of fingers that touch."""
+    on_tip: Int[Tensor, "N"]
+    """Number of those that touch with the tip."""
+    penetration: Float[Tensor, "N"]
+    """Depth of the deepest point of the closed hand in the object, m."""
     epsilon: Float[Tensor, "N"]
-    """0 where the closed hand penetrates."""
     capacity: Float[Tensor, "N"]
-    """How many times the object's weight the grasp holds; likewise."""
+    """How many times the object's weight the grasp holds."""
+    contacts: Float[Tensor, "N F 3"]
+    """In the grasps' frame, m; NaN where a finger does not touch, as are the next."""
+    normals: Float[Tensor, "N F 3"]
+    """Out of the object."""
+    com: Float[Tensor, "N 3"]
+    """The object's centre of mass, in the grasps' frame, m; of no object: 0, as are the next two."""
+    radius: Float[Tensor, "N"]
+    """Largest distance from it to the object's surface, m."""
+    weight: Float[Tensor, "N"]
+    """N, as in `lift-v1`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,23 +160,34 @@ class Truth:
 
     def outcome(self, grasps: Grasps) -> Outcome:
         """Close grasps on their own `object` and tell what came of it; nothing is clear or touches where that is -1."""
-        limits = self.settings
-        free, touched = grasps.object >= 0, torch.zeros(len(grasps), dtype=torch.long)
-        quality, capacity = torch.zeros_like(grasps.quality), torch.zeros_like(grasps.quality)
+        count, fingers = len(grasps), len(self.closer.hand.fingers)
+        free, whole = grasps.object >= 0, torch.zeros(count, dtype=torch.long)
+        none, nowhere = torch.zeros_like(grasps.quality), grasps.contacts.new_full((count, fingers, 3), math.nan)
+        places = none.new_zeros(count, 3)
+        found = Outcome(free, whole, whole, none, none, none, nowhere, nowhere, places, none, none)
+        found = Outcome(**{name: value.clone() for name, value in found.tensors().items()})
         rows = free.nonzero().flatten()
         if self.clear is not None and len(rows):
-            free[rows] = self.clear(grasps[rows])
+            found.clear[rows] = self.clear(grasps[rows])
         for number in grasps.object[grasps.object >= 0].unique().tolist():
             rows, body = (grasps.object == number).nonzero().flatten(), self.bodies[number]
             closure = self._closed(grasps[rows], number)
-            touched[rows] = closure.touched.sum(dim=1)
-            found = torch.as_tensor(self._model(body).epsilon(closure.contacts, closure.normals).values).to(quality)
-            sound = closure.penetration <= limits.penetration
-            quality[rows] = torch.where(sound, found, 0.0)
+            touches = closure.contacts, closure.normals
+            found.touched[rows], found.on_tip[rows] = closure.touched.sum(dim=1), closure.on_tip.sum(dim=1)
+            found.penetration[rows] = closure.penetration.to(none)
+            found.epsilon[rows] = torch.as_tensor(self._model(body).epsilon(*touches).values).to(none)
             pose = self.object_T_frame[number] @ grasps.pose[rows].double()
-            held = self._capacity(pose, closure.joints, closure.contacts, closure.normals, number)
-            capacity[rows] = torch.where(sound, held.to(capacity), 0.0)
-        return Outcome(free, touched, quality, capacity)
+            found.capacity[rows] = self._capacity(pose, closure.joints, *touches, number).to(none)
+            turn, place = inverse(self.object_T_frame[number])[:3].split([3, 1], dim=1)
+            found.contacts[rows] = (closure.contacts.double() @ turn.T + place.T).to(none)
+            found.normals[rows] = (closure.normals.double() @ turn.T).to(none)
+            found.com[rows] = (torch.as_tensor(body.com).double() @ turn.T + place[:, 0]).to(none)
+            found.radius[rows], found.weight[rows] = body.radius, self._load.weight(body.volume)
+        return found
+
+    @property
+    def _load(self) -> Load:
+        return Load(friction=self.settings.friction, edges=self.settings.edges)
 
     def _capacity(
         self,
@@ -177,8 +201,7 @@ class Truth:
         if self.up is None:
             return torch.full((len(joints),), math.inf, dtype=torch.float64)
         up = self.object_T_frame[index][:3, :3] @ self.up.double()
-        load = Load(friction=self.settings.friction, edges=self.settings.edges)
-        return load.capacity(self.closer.hand, self.bodies[index], object_T_base, joints, contacts, normals, up)
+        return self._load.capacity(self.closer.hand, self.bodies[index], object_T_base, joints, contacts, normals, up)
 
     def _closed(self, grasps: Grasps, index: int) -> "Closure":
         touching = grasps.touching

@@ -26,6 +26,7 @@ from dexgrasp.selection import free, on_table, select
 from dexgrasp.simulation.protocol import load_protocol
 from dexgrasp.threads import one_thread
 from dexgrasp.training.scorer_settings import ScorerSettings
+from dexgrasp.training.surrogate import facts
 
 DRAWN = 3
 """So many times the grasps wanted of a view are drawn: most meet what the camera sees."""
@@ -51,8 +52,10 @@ class Proposals(Batch):
     """What lies about its fingertips, see `dexgrasp.scorer.at_tips`; half precision."""
     score: Float[Tensor, "N"]
     """Probability of graspable as the heads tell it."""
+    facts: Float[Tensor, "N K"]
+    """How it closes on the true object, see `dexgrasp.training.surrogate.facts`."""
     worth: Float[Tensor, "N"]
-    """How likely the grasp is to lift, by how it closes on the true object."""
+    """How likely the grasp is to lift, by what it then holds (`ScorerSettings.capacity`)."""
     lifted: Float[Tensor, "N"]
     """What the simulator says: 1 lifted, 0 not, NaN not tried."""
     holds: Bool[Tensor, "N"]
@@ -109,17 +112,18 @@ def _of_view(
     truth = scene_truth(dataset, dataset.scene_of(index), view.world_T_camera.double())
     found = truth.outcome(done)
     # 0: one finger or none; else by how many times its weight the object is held.
-    kind = 1 + torch.bucketize(found.capacity, torch.tensor(settings.capacity).to(found.capacity), right=True)
+    held = torch.where(found.penetration <= truth.settings.penetration, found.capacity, 0.0)
+    kind = 1 + torch.bucketize(held, torch.tensor(settings.capacity).to(held), right=True)
     kind[found.touched < 2] = 0
     worth = torch.where(found.clear, torch.tensor(settings.clear)[kind], torch.tensor(settings.blocked)[kind])
-    holds = found.clear & (found.capacity >= max(truth.settings.capacity, 1.0))
+    holds = found.clear & (held >= max(truth.settings.capacity, 1.0))
     around = surroundings(hand, grasps, coarse[:COARSE]).half()
     tips = at_tips(hand, grasps, coarse, AT_TIP if settings.tips else 0).half()
     lifted = torch.full_like(worth, torch.nan)
     tried = len(grasps) if own else settings.verdicts
     lifted[:tried] = _executed(dataset, view, done[:tried], index, settings.protocol)
     told_by = features[at], cloud[seeds[at]], grasps.pose, grasps.joints, around, tips, grasps.quality
-    return Proposals(*told_by, worth, lifted, holds)
+    return Proposals(*told_by, facts(hand, done, found), worth, lifted, holds)
 
 
 def _some(

@@ -30,6 +30,7 @@ class ScorerSettings:
     raised: float = 0.0
     per_view: int = 200
     verdicts: int = 0
+    surrogate: bool = False
     rounds: int = 1
     chosen: int = 2
     protocol: str = "lift-bulk-v1"
@@ -55,6 +56,9 @@ class ScorerSettings:
         if self.verdicts < 0 or self.weight <= 0:
             found = f"{self.verdicts}, {self.weight}"
             raise DexgraspError("scorer.verdicts of at least 0, scorer.weight above it", found, "set them so")
+        if self.surrogate and not self.verdicts and self.rounds == 1:
+            remedy = "set scorer.verdicts or scorer.rounds, or scorer.surrogate=false"
+            raise DexgraspError("verdicts of which a surrogate learns", "scorer.verdicts=0, scorer.rounds=1", remedy)
         load_protocol(self.protocol).on_table("the scorer's verdicts")
         for name in ("clear", "blocked"):
             worth, wanted = getattr(self, name), len(self.capacity) + 2

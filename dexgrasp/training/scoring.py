@@ -1,5 +1,6 @@
 """Teaching the scorer: the network's own grasps on the training's views, judged on the true objects."""
 
+import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from dexgrasp.statistics import roc_area
 from dexgrasp.threads import one_thread
 from dexgrasp.training.proposals import Proposals, propose
 from dexgrasp.training.scorer_settings import ScorerSettings
+from dexgrasp.training.surrogate import FEWEST, Surrogate
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,10 @@ class ScorerSummary:
     """Reliability (`dexgrasp.reliability`) on what was executed of validation views, before it was calibrated there."""
     chosen: dict[str, Any] | None = None
     """The same of what the scorer itself chose there."""
+    promise: float | None = None
+    """How likely random grasps of the network on validation views are to lift, as the teacher thinks, in the mean."""
+    surrogate: dict[str, Any] | None = None
+    """On all that was executed of validation views: areas under the ROC of the surrogate, and of what grasps hold."""
 
 
 def fit_scorer(
@@ -62,27 +68,56 @@ def fit_scorer(
     known = propose(path, dataset, views, settings, seed, workers, "scorer")
     if not len(known):  # nothing to learn from: the heads' own score stays
         return ScorerSummary(0, 0.0, time.perf_counter() - began)
+    known, surrogate = _foretold(known, settings, seed)
     model.scorer = scorer = _fitted(model, known, settings, seed, start)
     for turn in range(1, settings.rounds):
         told = f"scorer, its own choice {turn}"
         known = Proposals.cat([known, _choose(model, dataset, views, settings, seed, workers, told)])
+        known, surrogate = _foretold(known, settings, seed)
         model.scorer = scorer = _fitted(model, known, settings, seed, start)
-    area = before = verdicts = own = None
+    area = before = verdicts = own = promise = foretelling = None
     if unseen := dataset.split("validation"):
         rest = propose(path, dataset, unseen, settings, seed, workers, "scorer, validation")
         told_so = _told_by(scorer, rest)
         area, before = roc_area(told_so, rest.holds), roc_area(rest.score, rest.holds)
         verdicts = _reliable(told_so, rest)
+        promise = float(_thought(surrogate, rest).double().mean()) if len(rest) else None
         if settings.rounds > 1:
             chosen = _choose(model, dataset, unseen, settings, seed, workers, "scorer, validation of its choice")
             own = _reliable(_told_by(scorer, chosen), chosen)
             rest = Proposals.cat([rest, chosen])
             told_so = _told_by(scorer, rest)
         tried = ~rest.lifted.isnan()
+        if surrogate is not None and tried.any():
+            foretelling = _areas(surrogate, rest[tried])
         if tried.any():
             scorer.calibrate(told_so[tried], rest.lifted[tried])
     holding, seconds = float(known.holds.double().mean()), time.perf_counter() - began
-    return ScorerSummary(len(known), holding, seconds, area, before, verdicts, own)
+    return ScorerSummary(len(known), holding, seconds, area, before, verdicts, own, promise, foretelling)
+
+
+def _foretold(known: Proposals, settings: ScorerSettings, seed: int) -> tuple[Proposals, Surrogate | None]:
+    """Return the proposals with what a surrogate of physics says that they are worth, and it, where there is one."""
+    if not settings.surrogate:
+        return known, None
+    tried = ~known.lifted.isnan()
+    if (count := int(tried.sum())) < FEWEST:
+        print(f"{count} verdicts, of {FEWEST} for a surrogate: the table judges (scorer.capacity)", file=sys.stderr)
+        return known, None
+    surrogate = Surrogate.taught(known.facts[tried], known.lifted[tried], seed)
+    return known.replace(worth=_thought(surrogate, known)), surrogate
+
+
+@one_thread()
+@torch.no_grad()
+def _thought(surrogate: Surrogate | None, known: Proposals) -> Float[Tensor, "N"]:
+    return known.worth if surrogate is None else surrogate(known.facts)
+
+
+def _areas(surrogate: Surrogate, tried: Proposals) -> dict[str, Any]:
+    win = tried.lifted > 0
+    areas = {"area": roc_area(_thought(surrogate, tried), win), "area_held": roc_area(tried.worth, win)}
+    return {"trials": len(tried), **areas}
 
 
 @one_thread()
