@@ -28,6 +28,8 @@ LIMIT = 20_000_000
 """Bytes that all weights of the package may have together."""
 MOVED = 0.005
 """How far a grasp may move in half precision: m, rad, and of its score."""
+BEGAN = "What it began with"
+"""How the part of a card begins that tells of weights shipped before."""
 KEPT = 0.95
 """Share of the grasps that must stay within that."""
 
@@ -159,15 +161,15 @@ def _before(config: Any) -> dict[str, list[str]]:
     if not card.is_file():
         told["How it was made"] = ["- it began with another training, whose card is its own"]
         return told
+    # Of a scorer that was taught anew nothing is left: the network alone counts, and what that began with.
+    alone = OmegaConf.select(config, "trainer.steps") == 0 and bool(OmegaConf.select(config, "scorer.anew"))
     for section in card.read_text().split("\n## ")[1:]:
         title, *lines = section.splitlines()
         if title in told:
-            told[title] = [
-                "",
-                f"What it began with, `{start}` as shipped before:",
-                "",
-                *[each for each in lines if each],
-            ]
+            lines = [each for each in lines if each]
+            earlier = [row for row, each in enumerate(lines) if each.startswith(BEGAN)]
+            lines = lines[earlier[-1] + 1 :] if alone and earlier else lines
+            told[title] = ["", f"{BEGAN}, {'the network of ' if alone else ''}`{start}` as shipped before:", "", *lines]
     return told
 
 

@@ -123,6 +123,20 @@ def test_a_card_tells_what_its_weights_began_with(model, tmp_path, monkeypatch):
     assert "another training" in third and "seed 5" not in third
 
 
+def test_a_card_forgets_a_scorer_of_which_nothing_is_left(model, tmp_path, monkeypatch):
+    monkeypatch.setattr(shipping, "WEIGHTS", tmp_path / "weights")
+    for steps, seed, start in ((7, 1, None), (0, 2, "tiny"), (0, 3, "tiny")):
+        run = tmp_path / str(seed)
+        save_model(run / "model.safetensors", model, {"seed": seed, "steps": steps})
+        told = {"init_from": start, "trainer": {"steps": steps}, "scorer": {"anew": True}}
+        told |= {"dataset": {"objects": {"kind": "procedural", "split": "train", "seed": seed}}}
+        OmegaConf.save(OmegaConf.create(told), run / "config.yaml")
+        shipping.ship(run / "model.safetensors", "tiny", tmp_path / "weights", views=2)
+    card = (tmp_path / "weights" / "tiny.md").read_text()
+    assert "seed 3, 0 steps" in card and "seed 1, 7 steps" in card and "seed 2, 0 steps" not in card
+    assert card.count("What it began with, the network of `tiny` as shipped before:") == 2
+
+
 def test_what_is_not_shipped(model, tmp_path, monkeypatch):
     path = tmp_path / "run" / "model.safetensors"
     save_model(path, model)
