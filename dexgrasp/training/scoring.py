@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -22,6 +22,7 @@ from dexgrasp.scorer import Scorer
 from dexgrasp.seeds import stream, torch_stream
 from dexgrasp.statistics import roc_area
 from dexgrasp.threads import one_thread
+from dexgrasp.training.descent import descend
 from dexgrasp.training.proposals import Proposals, propose
 from dexgrasp.training.scorer_settings import ScorerSettings
 from dexgrasp.training.surrogate import FEWEST, Surrogate
@@ -152,25 +153,16 @@ def _sizes(scorer: Scorer) -> dict[str, torch.Size]:
 
 @one_thread()
 def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) -> None:
+    def loss_of(index: Int[Tensor, "B"]) -> Float[Tensor, ""]:
+        rows = known[index]
+        logits = scorer(rows.features, rows.at, _grasps(rows), rows.around, rows.tips)
+        tried = ~rows.lifted.isnan()
+        wanted = torch.where(tried, rows.lifted, rows.worth)
+        return F.binary_cross_entropy_with_logits(logits, wanted, torch.where(tried, settings.weight, 1.0))
+
     scorer.train()
-    optimizer = torch.optim.AdamW(scorer.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
-    size = min(settings.batch, len(known))
-    steps = settings.epochs * (len(known) // size)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, settings.learning_rate, total_steps=steps + 1)
-    order = torch_stream(seed, "scorer order")
-    for _ in range(settings.epochs):
-        shuffled = torch.randperm(len(known), generator=order)
-        for start in range(0, len(known) - size + 1, size):
-            rows = known[shuffled[start : start + size]]
-            logits = scorer(rows.features, rows.at, _grasps(rows), rows.around, rows.tips)
-            tried = ~rows.lifted.isnan()
-            wanted = torch.where(tried, rows.lifted, rows.worth)
-            weight = torch.where(tried, settings.weight, 1.0)
-            loss = F.binary_cross_entropy_with_logits(logits, wanted, weight)
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            schedule.step()
+    how = settings.batch, settings.epochs, settings.learning_rate, settings.weight_decay
+    descend(scorer, loss_of, len(known), *how, torch_stream(seed, "scorer order"))
     scorer.eval()
 
 

@@ -3,7 +3,7 @@
 from itertools import pairwise
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -13,6 +13,7 @@ from dexgrasp.hand import Hand
 from dexgrasp.load_capacity import lifts
 from dexgrasp.seeds import stream, torch_stream
 from dexgrasp.threads import one_thread
+from dexgrasp.training.descent import descend
 
 FACTS = 17
 """Numbers by which a closed grasp is known, see `facts`."""
@@ -60,21 +61,13 @@ class Surrogate(nn.Module):
         surrogate.middle.copy_(known.mean(dim=0))
         surrogate.spread.copy_(known.std(dim=0) + 1e-6)
         scaled = (known - surrogate.middle) / surrogate.spread
-        size = min(BATCH, len(known))
         for number, member in enumerate(surrogate.members):
+
+            def loss_of(rows: Int[Tensor, "B"], member: nn.Module = member) -> Float[Tensor, ""]:
+                return F.binary_cross_entropy_with_logits(member(scaled[rows]).squeeze(1), lifted[rows])
+
             order = torch_stream(seed, "surrogate order", number)
-            optimizer = torch.optim.AdamW(member.parameters(), RATE, weight_decay=DECAY)
-            steps = EPOCHS * (len(known) // size)
-            schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps + 1)
-            for _ in range(EPOCHS):
-                shuffled = torch.randperm(len(known), generator=order)
-                for start in range(0, len(known) - size + 1, size):
-                    rows = shuffled[start : start + size]
-                    loss = F.binary_cross_entropy_with_logits(member(scaled[rows]).squeeze(1), lifted[rows])
-                    optimizer.zero_grad()
-                    loss.backward()
-                    optimizer.step()
-                    schedule.step()
+            descend(member, loss_of, len(known), BATCH, EPOCHS, RATE, DECAY, order)
         return surrogate.eval()
 
 
@@ -87,7 +80,7 @@ def facts(hand: Hand, grasps: Grasps, found: Outcome) -> Float[Tensor, "N K"]:
     palm looks, 1 for up, and its height.
     """
     touching = ~found.contacts.isnan().any(dim=2)
-    some, count = touching.any(dim=1), touching.sum(dim=1, keepdim=True).clamp(min=1)
+    some, count = touching.any(dim=1), found.touched[:, None].clamp(min=1)
     off = torch.where(touching[..., None], found.contacts - found.com[:, None], 0.0)
     middle, outward = off.sum(dim=1) / count, torch.where(touching[..., None], found.normals, 0.0).sum(dim=1)
     top = torch.where(touching, off[..., 2], -torch.inf).amax(dim=1)
