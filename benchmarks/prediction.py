@@ -27,7 +27,7 @@ from torch import Tensor
 
 import dexgrasp
 from benchmarks.interleaved import compare, record
-from dexgrasp import config, heads, sampling, scorer
+from dexgrasp import config, heads, sampling, surroundings
 from dexgrasp.cloud import prepare
 from dexgrasp.dataset import normals
 from dexgrasp.geometry import inverse
@@ -122,10 +122,10 @@ def plain() -> Iterator[None]:
         for place, name, instead in (
             (normals, "estimate_normals", plain_normals),
             (network, "farthest_points", sampling.farthest_points_reference),
-            (scorer, "farthest_points", sampling.farthest_points_reference),
+            (surroundings, "farthest_points", sampling.farthest_points_reference),
             (network, "neighbours", sampling.neighbours_reference),
             (layers, "ball_max", ball_max_reference),
-            (scorer, "_compiled", scorer.around_reference),
+            (surroundings, "_compiled", surroundings.around_reference),
             (heads.Layers, "forward", plain_layers),
         ):
             stack.enter_context(patch.object(place, name, instead))

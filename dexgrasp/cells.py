@@ -32,13 +32,25 @@ BITS = 20
 
 def make_cells(points: np.ndarray, side: float) -> Cells:
     """Sort points (N, 3) into cells of `side`, larger where 2^20 of them would not reach."""
-    low = points.min(axis=0)
-    side = max(side, float((points.max(axis=0) - low).max()) / (2**BITS - 4), 1e-12)
+    points = np.ascontiguousarray(points, np.float64)
+    low, high = bounds(points)
+    side = max(side, float((high - low).max()) / (2**BITS - 4), 1e-12)
     slots = 1 << max(4, int(2 * len(points) - 1).bit_length())
     keys, starts, stops = np.full(slots, -1), np.zeros(slots, np.int64), np.zeros(slots, np.int64)
     sorted_points, order = np.empty((3, len(points))), np.empty(len(points), np.int64)
-    occupied = _fill(points.astype(np.float64), low.astype(np.float64), side, keys, starts, stops, sorted_points, order)
+    occupied = _fill(points, low, side, keys, starts, stops, sorted_points, order)
     return Cells(sorted_points, order, keys, starts, stops, low, side, occupied)
+
+
+@njit(cache=True)
+def bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the largest coordinates of points (N, 3), (3,) each; several times faster than numpy's."""
+    low, high = points[0].copy(), points[0].copy()
+    for n in range(1, len(points)):
+        for axis in range(3):
+            low[axis] = min(low[axis], points[n, axis])
+            high[axis] = max(high[axis], points[n, axis])
+    return low, high
 
 
 @njit(cache=True)

@@ -32,8 +32,9 @@ from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.level import carried, level_frame
 from dexgrasp.representation import Prediction, Representation, Targets
-from dexgrasp.scorer import Scorer, coarse_points
+from dexgrasp.scorer import Scorer
 from dexgrasp.selection import Selection, select
+from dexgrasp.surroundings import coarse_points
 from dexgrasp.table import find_table
 
 

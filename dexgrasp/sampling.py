@@ -13,10 +13,14 @@ from torch import Tensor
 
 from dexgrasp import kernels
 from dexgrasp.borrow import borrowed
-from dexgrasp.cells import BITS, Cells, find_cell, make_cells
+from dexgrasp.cells import BITS, Cells, bounds, find_cell, make_cells
 
 _BUCKET = 64
 """Points per bucket: below it the tests of the boxes dominate, above it the distances."""
+
+
+FEW = 256
+"""Among so few points, looking at all of them is quicker than a tree."""
 
 
 def farthest_points(points: Float[Tensor, "N 3"], count: int) -> Int[Tensor, "count"]:
@@ -56,6 +60,8 @@ def neighbours(
     if kernels.usable(points):
         return kernels.arrange(points[None]).nearest(centres[None], count, radius)[0]
     cloud, query = (part.detach().cpu().double().numpy() for part in (points, centres))
+    if radius == float("inf") and count <= len(cloud) <= FEW:
+        return torch.from_numpy(_nearest(np.ascontiguousarray(cloud.T), query, count)).to(points.device)
     if radius == float("inf"):
         index = cKDTree(cloud, balanced_tree=False, compact_nodes=False).query(query, k=range(1, count + 1))[1]
         return torch.from_numpy(np.where(index == len(cloud), index[:, :1], index)).to(points.device)
@@ -118,6 +124,28 @@ def _in_ball(cells: Cells, centres: np.ndarray, count: int, radius: float) -> np
     return index
 
 
+@njit(cache=True)
+def _nearest(columns: np.ndarray, centres: np.ndarray, count: int) -> np.ndarray:
+    """Return the nearest `count` of points (3, N), nearest first, of each centre (M, 3)."""
+    columns, centres = borrowed(columns), borrowed(centres)
+    px, py, pz = columns
+    index, best, apart = np.empty((len(centres), count), np.int64), np.empty(count), np.empty(len(px))
+    for m in range(len(centres)):
+        x, y, z = centres[m]
+        for n in range(len(px)):
+            u, v, w = px[n] - x, py[n] - y, pz[n] - z
+            apart[n] = u * u + v * v + w * w
+        best[:] = np.inf
+        for n in range(len(px)):
+            if apart[n] < best[count - 1]:
+                place = count - 1
+                while place > 0 and best[place - 1] > apart[n]:
+                    best[place], index[m, place] = best[place - 1], index[m, place - 1]
+                    place -= 1
+                best[place], index[m, place] = apart[n], n
+    return index
+
+
 def _squared(vectors: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
     x, y, z = vectors.unbind(-1)
     return x * x + y * y + z * z  # the kernel's order of operations, bit by bit
@@ -125,8 +153,8 @@ def _squared(vectors: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
 
 def morton(xyz: np.ndarray) -> np.ndarray:
     """Return the position of each point along a space-filling curve (Morton 1966), 10 bits an axis."""
-    low = xyz.min(axis=0)
-    extent = max(float((xyz.max(axis=0) - low).max()), 1e-9)
+    low, high = bounds(xyz)
+    extent = max(float((high - low).max()), 1e-9)
     cells = ((xyz - low) * np.float32(1023.0 / extent)).astype(np.uint32)
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         cells = (cells | (cells << np.uint32(shift))) & np.uint32(mask)

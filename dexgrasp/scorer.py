@@ -3,28 +3,17 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit
 from torch import Tensor, nn
 
-from dexgrasp.geometry import transform
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.heads import Layers, mlp
-from dexgrasp.sampling import farthest_points
+from dexgrasp.surroundings import AT_TIP, COARSE, FINE, NEAREST, REACH, look
 
-COARSE, NEAREST = 512, 64
-"""Of so many points, spread evenly over the scene, a grasp is judged by the ones nearest to the middle of its tips."""
-FINE, AT_TIP = 2048, 16
-"""And of so many by the ones nearest to each fingertip."""
 PIECE = 32
 """Hands whose surroundings are looked at together in evaluation."""
-BLOCK = 32
-"""Points that are passed over together where none of them is near."""
-REACH, TIP_REACH = 0.1, 0.03
-"""Offsets and heights (m) in units of this are numbers of order one; about a fingertip, of the other."""
 
 
 class Scorer(nn.Module):
@@ -83,8 +72,7 @@ class Scorer(nn.Module):
         self, grasps: Grasps, points: Float[Tensor, "Q 6"]
     ) -> tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F T 7"]]:
         """Return what it sees about hands and fingertips of a scene's `coarse_points`, `self.spread` of them."""
-        tips = at_tips(self.hand, grasps, points, AT_TIP if self.tips is not None else 0)
-        return surroundings(self.hand, grasps, points[:COARSE]), tips
+        return look(self.hand, grasps, points, AT_TIP if self.tips is not None else 0)
 
     def forward(
         self,
@@ -145,122 +133,3 @@ def platt(logits: Float[Tensor, "N"], came: Float[Tensor, "N"]) -> tuple[float, 
         if step.abs().max() < 1e-9:
             break
     return max(float(found[0]), 1e-3), float(found[1])
-
-
-def coarse_points(cloud: Float[Tensor, "N 6"], count: int = COARSE) -> Float[Tensor, "Q 6"]:
-    """Return `count` points that are spread evenly over a cloud (farthest-point samples); more begin with fewer."""
-    return cloud[farthest_points(cloud[:, :3], min(count, len(cloud)))]
-
-
-def surroundings(hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"]) -> Float[Tensor, "N K 7"]:
-    """Return the `points` about each hand: position and normal in its palm's frame, height in the level one; scaled.
-
-    The K nearest to the middle of its tips, in no particular order.
-    """
-    points = points.to(grasps.pose)
-    middle = transform(grasps.pose, hand.fingertips(grasps.joints)[..., :3, 3].mean(dim=1).to(grasps.pose))
-    palm = grasps.pose @ hand.base_T_palm.to(grasps.pose)
-    return _seen(middle, palm, points, NEAREST, REACH)
-
-
-def at_tips(hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"], count: int = AT_TIP) -> Float[Tensor, "N F T 7"]:
-    """Return the `count` points nearest to each fingertip's centre, in its frame (`Hand.fingertips`), scaled.
-
-    Position, normal and height in the level frame, in no particular order.
-    """
-    tips = grasps.pose[:, None] @ hand.fingertips(grasps.joints).to(grasps.pose)
-    if not count:
-        return tips.new_zeros(*tips.shape[:2], 0, 7)
-    every = tips.flatten(0, 1)
-    return _seen(every[:, :3, 3], every, points.to(tips), count, TIP_REACH).unflatten(0, tips.shape[:2])
-
-
-def _seen(
-    middle: Float[Tensor, "N 3"], frame: Float[Tensor, "N 4 4"], points: Float[Tensor, "Q 6"], count: int, reach: float
-) -> Float[Tensor, "N K 7"]:
-    count = min(count, len(points))
-    compiled = frame.device.type == "cpu" and frame.dtype == torch.float32 and not torch.compiler.is_compiling()
-    quick = compiled and not frame.requires_grad
-    return (_compiled if quick else around_reference)(middle, frame, points, count, reach)
-
-
-def around_reference(
-    middle: Float[Tensor, "N 3"],
-    frame: Float[Tensor, "N 4 4"],
-    points: Float[Tensor, "Q 6"],
-    count: int,
-    reach: float = REACH,
-) -> Float[Tensor, "N K 7"]:
-    """Return the `count` points nearest to each `middle`, in a frame of each and over `reach` (m), in plain torch."""
-    apart = middle[:, None] - points[:, :3]
-    nearest = apart.square().sum(dim=-1).topk(count, largest=False).indices
-    positions, normals = points[nearest].split(3, dim=-1)
-    local = (positions - frame[:, None, :3, 3]) @ frame[:, :3, :3] / reach
-    return torch.cat([local, normals @ frame[:, :3, :3], positions[..., 2:] / reach], dim=-1)
-
-
-def _compiled(
-    middle: Float[Tensor, "N 3"], frame: Float[Tensor, "N 4 4"], points: Float[Tensor, "Q 6"], count: int, reach: float
-) -> Float[Tensor, "N K 7"]:
-    out = torch.empty(len(middle), count, 7)
-    one, other, third = (part.detach().contiguous().numpy() for part in (middle, frame, points))
-    _around(one, other, third, np.float32(1 / reach), out.numpy())
-    return out
-
-
-@njit(cache=True)
-def _around(middle: np.ndarray, frame: np.ndarray, points: np.ndarray, scale: np.float32, out: np.ndarray) -> None:
-    count, total = out.shape[1], len(points)
-    x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
-    apart, last = np.empty(total, np.float32), np.float32(1e-3)
-    zero, half, top = np.float32(0), np.float32(0.5), np.float32(np.inf)
-    for i in range(len(middle)):
-        a, b, c = middle[i]
-        for k in range(total):
-            u, v, w = x[k] - a, y[k] - b, z[k] - c
-            apart[k] = u * u + v * v + w * w
-        # The limit within which `count` lie. Counting is quick, and a few guesses are enough: that of the place before,
-        # then as if points lay on a plane, and the middle where that does not lead on.
-        below, limit, inside, guess, turns = np.float32(-1), top, total, last, 0
-        while inside != count:
-            if not (below < guess < limit):
-                guess = half * (max(below, zero) + limit)
-                if not (below < guess < limit):
-                    break  # neighbouring numbers: several points lie at the very limit
-            found = 0
-            for k in range(total):
-                found += apart[k] <= guess
-            if found < count:
-                below = guess
-            else:
-                limit, inside = guess, found
-            turns += 1
-            if limit == top:
-                guess = np.float32(4) * guess
-            elif turns < 8:
-                guess = limit * np.float32(count + 0.5) / np.float32(inside + 0.5)
-            else:
-                guess = half * (max(below, zero) + limit)
-        last = limit if zero < limit < top else last
-        room = count  # for points at the very limit: as many as nearer ones leave
-        for k in range(total):
-            room -= apart[k] < limit
-        r, n = frame[i], 0
-        for start in range(0, total, BLOCK):
-            stop, some = min(start + BLOCK, total), 0
-            for k in range(start, stop):
-                some += apart[k] <= limit
-            if some == 0:
-                continue
-            for k in range(start, stop):
-                if not apart[k] <= limit or (apart[k] == limit and room == 0) or n == count:
-                    continue
-                room -= apart[k] == limit
-                u, v, w = x[k] - r[0, 3], y[k] - r[1, 3], z[k] - r[2, 3]
-                p, q, s = points[k, 3], points[k, 4], points[k, 5]
-                for axis in range(3):
-                    out[i, n, axis] = (u * r[0, axis] + v * r[1, axis] + w * r[2, axis]) * scale
-                    out[i, n, 3 + axis] = p * r[0, axis] + q * r[1, axis] + s * r[2, axis]
-                out[i, n, 6] = z[k] * scale
-                n += 1
-        out[i, n:] = np.nan  # of a place that is none

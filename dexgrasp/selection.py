@@ -131,8 +131,8 @@ def free(
 
 
 def _chunks(total: int, top_k: int) -> Iterator[tuple[int, int]]:
-    """Ranges over the candidates: as many as are wanted first, then ever more."""
-    start, size = 0, max(16, top_k)
+    """Ranges over the candidates: first about as many as hold those wanted, of BarrettHand's, then ever more."""
+    start, size = 0, max(16, 3 * top_k)
     while start < total:
         yield start, min(start + size, total)
         start, size = start + size, min(2 * size, 256)

@@ -116,6 +116,7 @@ def test_compiled_maximum_equals_torch(integer):
     weight = torch.randn(25, 9, generator=generator)
     expected = ball_max_reference(rows, group)
     assert torch.equal(ball_max(rows, group.to(integer)), expected)
+    assert torch.equal(ball_max(rows.detach(), group.to(integer)), expected)  # tells no source
     distinct = torch.randn(60, 9, generator=generator, requires_grad=True)  # ties may go to either
     (gradient,) = torch.autograd.grad((ball_max(distinct, group) * weight).sum(), distinct)
     (expected,) = torch.autograd.grad((ball_max_reference(distinct, group) * weight).sum(), distinct)

@@ -15,20 +15,19 @@ from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import axis_angle, pose, rotate, transform
 from dexgrasp.grasps import Grasps
 from dexgrasp.model import GraspNet, build_model, load_model, save_model
-from dexgrasp.scorer import (
+from dexgrasp.scorer import Scorer, platt
+from dexgrasp.selection import Selection
+from dexgrasp.statistics import roc_area
+from dexgrasp.surroundings import (
     AT_TIP,
     COARSE,
     FINE,
     NEAREST,
-    Scorer,
     around_reference,
     at_tips,
     coarse_points,
-    platt,
     surroundings,
 )
-from dexgrasp.selection import Selection
-from dexgrasp.statistics import roc_area
 from dexgrasp.table import find_table
 from dexgrasp.testing.samples import seen
 from dexgrasp.training import proposals, scoring

@@ -21,6 +21,8 @@ FEWEST = 10
 """Points of a loose cloud that are used however far they are: where a cloud is thin, one radius holds too few."""
 SPARSE, WIDER = 10, 1.7
 """Where cells of one radius hold fewer points than this, so much larger ones are looked through."""
+WIDENINGS = 2
+"""Cells are doubled so often for points of which those about them hold too few, before a tree is built."""
 RADIUS = 0.010
 """Neighbourhood (m): about 2 deg of noise for 1 mm of depth noise at 1 mm a pixel, and still inside a 2 cm part."""
 
@@ -50,6 +52,14 @@ def estimate_normals(
     wanted = np.zeros(len(cloud), np.bool_)
     wanted[rows] = True
     normals, lonely = _fit_near(cells, wanted, k, min(FEWEST, k), radius, eye)
+    for _ in range(WIDENINGS):
+        if len(lonely) == 0:
+            break
+        cells = make_cells(cloud, 2 * cells.side)
+        wanted[:] = False
+        wanted[lonely] = True
+        more, left = _fit_near(cells, wanted, k, min(FEWEST, k), radius, eye)
+        normals[lonely], lonely = more[lonely], left
     if len(lonely):
         neighbours = cKDTree(cloud).query(cloud[lonely], k=min(FEWEST, k))[1]
         normals[lonely] = _fit_neighbours(cloud, lonely, neighbours, eye)

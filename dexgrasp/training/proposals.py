@@ -20,10 +20,10 @@ from dexgrasp.level import levelled
 from dexgrasp.model import GraspNet, load_model
 from dexgrasp.progress import track
 from dexgrasp.scene import View
-from dexgrasp.scorer import AT_TIP, COARSE, FINE, at_tips, coarse_points, surroundings
 from dexgrasp.seeds import stream
 from dexgrasp.selection import free, on_table, select
 from dexgrasp.simulation.protocol import load_protocol
+from dexgrasp.surroundings import AT_TIP, FINE, coarse_points, look
 from dexgrasp.threads import one_thread
 from dexgrasp.training.scorer_settings import ScorerSettings
 from dexgrasp.training.surrogate import facts
@@ -47,9 +47,9 @@ class Proposals(Batch):
     """level_T_base, m."""
     joints: Float[Tensor, "N J"]
     around: Float[Tensor, "N K 7"]
-    """What lies about the hand, see `dexgrasp.scorer.surroundings`; half precision."""
+    """What lies about the hand, see `dexgrasp.surroundings.surroundings`; half precision."""
     tips: Float[Tensor, "N F T 7"]
-    """What lies about its fingertips, see `dexgrasp.scorer.at_tips`; half precision."""
+    """What lies about its fingertips, see `dexgrasp.surroundings.at_tips`; half precision."""
     score: Float[Tensor, "N"]
     """Probability of graspable as the heads tell it."""
     facts: Float[Tensor, "N K"]
@@ -117,8 +117,7 @@ def _of_view(
     kind[found.touched < 2] = 0
     worth = torch.where(found.clear, torch.tensor(settings.clear)[kind], torch.tensor(settings.blocked)[kind])
     holds = found.clear & (held >= max(truth.settings.capacity, 1.0))
-    around = surroundings(hand, grasps, coarse[:COARSE]).half()
-    tips = at_tips(hand, grasps, coarse, AT_TIP if settings.tips else 0).half()
+    around, tips = (part.half() for part in look(hand, grasps, coarse, AT_TIP if settings.tips else 0))
     lifted = torch.full_like(worth, torch.nan)
     tried = len(grasps) if own else settings.verdicts
     lifted[:tried] = _executed(dataset, view, done[:tried], index, settings.protocol)

@@ -16,8 +16,13 @@ def ball_max(rows: Float[Tensor, "N C"], group: Int[Tensor, "M K"]) -> Float[Ten
 
     Groups padded by their first row (see `dexgrasp.sampling.neighbours`) cost no more than what they hold.
     """
-    compiled = rows.device.type == "cpu" and rows.dtype == torch.float32 and not torch.compiler.is_compiling()
-    return _BallMax.apply(rows, group) if compiled else ball_max_reference(rows, group)
+    if rows.device.type != "cpu" or rows.dtype != torch.float32 or torch.compiler.is_compiling():
+        return ball_max_reference(rows, group)
+    if torch.is_grad_enabled() and rows.requires_grad:
+        return _BallMax.apply(rows, group)
+    out = torch.empty(len(group), rows.shape[1])
+    _maximum(*_arrays(rows, group), out.numpy())
+    return out
 
 
 def ball_max_reference(rows: Float[Tensor, "N C"], group: Int[Tensor, "M K"]) -> Float[Tensor, "M C"]:
@@ -34,7 +39,7 @@ class _BallMax(torch.autograd.Function):
     def forward(ctx: Any, rows: Tensor, group: Tensor) -> Tensor:
         out = torch.empty(len(group), rows.shape[1])
         source = torch.empty(out.shape, dtype=torch.int32)
-        _maximum(rows.detach().contiguous().numpy(), group.contiguous().numpy(), out.numpy(), source.numpy())
+        _traced(*_arrays(rows, group), out.numpy(), source.numpy())
         ctx.save_for_backward(source)
         ctx.count = len(rows)
         return out
@@ -48,9 +53,31 @@ class _BallMax(torch.autograd.Function):
         return out, None
 
 
+def _arrays(rows: Tensor, group: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return rows, groups, and an order of the groups in which those that follow each other share rows."""
+    index = group.contiguous().numpy()
+    return rows.detach().contiguous().numpy(), index, np.argsort(index[:, 0], kind="stable")
+
+
 @njit(cache=True)
-def _maximum(rows: np.ndarray, group: np.ndarray, out: np.ndarray, source: np.ndarray) -> None:
-    for m in range(len(group)):
+def _maximum(rows: np.ndarray, group: np.ndarray, order: np.ndarray, out: np.ndarray) -> None:
+    for m in order:
+        first, best = group[m, 0], out[m]
+        best[:] = rows[first]
+        for k in range(1, group.shape[1], 2):  # two at a time: `best` is loaded and stored half as often
+            here, there = group[m, k], group[m, min(k + 1, group.shape[1] - 1)]
+            if here == first and there == first:  # padding
+                continue
+            one, other = rows[here], rows[there]
+            for c in range(len(best)):
+                larger = one[c] if one[c] > other[c] else other[c]
+                best[c] = larger if larger > best[c] else best[c]
+
+
+@njit(cache=True)
+def _traced(rows: np.ndarray, group: np.ndarray, order: np.ndarray, out: np.ndarray, source: np.ndarray) -> None:
+    """Also tell where each maximum comes from: the first of equals."""
+    for m in order:
         first = group[m, 0]
         best, where = out[m], source[m]
         best[:] = rows[first]

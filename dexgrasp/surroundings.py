@@ -1,0 +1,206 @@
+"""What lies about a proposed hand and about its fingertips, as a scorer looks at it."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numba import njit
+from torch import Tensor
+
+from dexgrasp.borrow import borrowed
+from dexgrasp.cells import BITS, Cells, find_cell, make_cells
+from dexgrasp.geometry import transform
+from dexgrasp.grasps import Grasps
+from dexgrasp.hand import Hand
+from dexgrasp.sampling import farthest_points
+
+COARSE, NEAREST = 512, 64
+"""Of so many points, spread evenly over the scene, a grasp is judged by the ones nearest to the middle of its tips."""
+FINE, AT_TIP = 2048, 16
+"""And of so many by the ones nearest to each fingertip."""
+NEAR = 0.08
+"""Side of the cells that are looked through first, m: smaller ones often hold too few."""
+BLOCK = 32
+"""Points that are passed over together where none of them is near."""
+REACH, TIP_REACH = 0.1, 0.03
+"""Offsets and heights (m) in units of this are numbers of order one; about a fingertip, of the other."""
+
+
+def coarse_points(cloud: Float[Tensor, "N 6"], count: int = COARSE) -> Float[Tensor, "Q 6"]:
+    """Return `count` points that are spread evenly over a cloud (farthest-point samples); more begin with fewer."""
+    return cloud[farthest_points(cloud[:, :3], min(count, len(cloud)))]
+
+
+def look(
+    hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"], count: int = AT_TIP
+) -> tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F T 7"]]:
+    """Return `surroundings` among the first of a scene's `coarse_points`, and `at_tips` among all of them."""
+    tips = hand.fingertips(grasps.joints)
+    return surroundings(hand, grasps, points[:COARSE], tips), at_tips(hand, grasps, points, count, tips)
+
+
+def surroundings(
+    hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"], tips: Float[Tensor, "N F 4 4"] | None = None
+) -> Float[Tensor, "N K 7"]:
+    """Return the `points` about each hand: position and normal in its palm's frame, height in the level one; scaled.
+
+    The K nearest to the middle of its tips, in no particular order. `tips` is `hand.fingertips` of the grasps' joints.
+    """
+    points = points.to(grasps.pose)
+    tips = hand.fingertips(grasps.joints) if tips is None else tips
+    middle = transform(grasps.pose, tips[..., :3, 3].mean(dim=1).to(grasps.pose))
+    palm = grasps.pose @ hand.base_T_palm.to(grasps.pose)
+    return _seen(middle, palm, points, NEAREST, REACH)
+
+
+def at_tips(
+    hand: Hand,
+    grasps: Grasps,
+    points: Float[Tensor, "Q 6"],
+    count: int = AT_TIP,
+    tips: Float[Tensor, "N F 4 4"] | None = None,
+) -> Float[Tensor, "N F T 7"]:
+    """Return the `count` points nearest to each fingertip's centre, in its frame (`Hand.fingertips`), scaled.
+
+    Position, normal and height in the level frame, in no particular order. `tips` as for `surroundings`.
+    """
+    if not count:
+        return grasps.pose.new_zeros(len(grasps), len(hand.fingers), 0, 7)
+    tips = hand.fingertips(grasps.joints) if tips is None else tips
+    tips = grasps.pose[:, None] @ tips.to(grasps.pose)
+    every = tips.flatten(0, 1)
+    return _seen(every[:, :3, 3], every, points.to(tips), count, TIP_REACH).unflatten(0, tips.shape[:2])
+
+
+def _seen(
+    middle: Float[Tensor, "N 3"], frame: Float[Tensor, "N 4 4"], points: Float[Tensor, "Q 6"], count: int, reach: float
+) -> Float[Tensor, "N K 7"]:
+    count = min(count, len(points))
+    compiled = frame.device.type == "cpu" and frame.dtype == torch.float32 and not torch.compiler.is_compiling()
+    quick = compiled and not frame.requires_grad
+    return (_compiled if quick else around_reference)(middle, frame, points, count, reach)
+
+
+def around_reference(
+    middle: Float[Tensor, "N 3"],
+    frame: Float[Tensor, "N 4 4"],
+    points: Float[Tensor, "Q 6"],
+    count: int,
+    reach: float = REACH,
+) -> Float[Tensor, "N K 7"]:
+    """Return the `count` points nearest to each `middle`, in a frame of each and over `reach` (m), in plain torch."""
+    apart = middle[:, None] - points[:, :3]
+    nearest = apart.square().sum(dim=-1).topk(count, largest=False).indices
+    positions, normals = points[nearest].split(3, dim=-1)
+    local = (positions - frame[:, None, :3, 3]) @ frame[:, :3, :3] / reach
+    return torch.cat([local, normals @ frame[:, :3, :3], positions[..., 2:] / reach], dim=-1)
+
+
+def _compiled(
+    middle: Float[Tensor, "N 3"], frame: Float[Tensor, "N 4 4"], points: Float[Tensor, "Q 6"], count: int, reach: float
+) -> Float[Tensor, "N K 7"]:
+    out = torch.empty(len(middle), count, 7)
+    one, other, third = (part.detach().contiguous().numpy() for part in (middle, frame, points))
+    cells = make_cells(third[:, :3], NEAR)
+    _around(one, other, third[cells.order], cells, np.float32(1 / reach), out.numpy())
+    return out
+
+
+@njit(cache=True)
+def _around(
+    middle: np.ndarray, frame: np.ndarray, points: np.ndarray, cells: Cells, scale: np.float32, out: np.ndarray
+) -> None:
+    """Fill `out` from points in the order of the cells: those about each place, or all where these hold too few."""
+    cells, points, frame = borrowed(cells), borrowed(points), borrowed(frame)
+    count, total = out.shape[1], len(points)
+    x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
+    apart, row, last = np.empty(total, np.float32), np.empty(total, np.int64), np.float32(1e-3)
+    low, side = cells.low, cells.side
+    reach = np.float32(side * side)
+    for i in range(len(middle)):
+        a, b, c = middle[i]
+        u, v, w = int((a - low[0]) / side) + 1, int((b - low[1]) / side) + 1, int((c - low[2]) / side) + 1
+        some = 0
+        for p in range(u - 1, u + 2):
+            for q in range(v - 1, v + 2):
+                for s in range(w - 1, w + 2):
+                    key = (p << 2 * BITS) | (q << BITS) | s
+                    slot = find_cell(cells.keys, key)
+                    if cells.keys[slot] == key:
+                        start = cells.starts[slot]
+                        for n in range(cells.stops[slot] - start):
+                            row[some + n] = start + n
+                            e, f, g = x[start + n] - a, y[start + n] - b, z[start + n] - c
+                            apart[some + n] = e * e + f * f + g * g
+                        some += cells.stops[slot] - start
+        inside = 0
+        for k in range(some):
+            inside += apart[k] <= reach
+        if inside < count:  # something nearer may lie in other cells
+            some = total
+            for k in range(total):
+                row[k] = k
+                e, f, g = x[k] - a, y[k] - b, z[k] - c
+                apart[k] = e * e + f * f + g * g
+        last = _copy_nearest(apart[:some], row, points, frame[i], last, scale, out[i])
+
+
+@njit(cache=True)
+def _copy_nearest(
+    apart: np.ndarray,
+    row: np.ndarray,
+    points: np.ndarray,
+    frame: np.ndarray,
+    last: np.float32,
+    scale: np.float32,
+    out: np.ndarray,
+) -> np.float32:
+    """Fill `out` (K, 7) with the K rows that are least far `apart`; return how far the last one is, squared.
+
+    Counting is quick, and a few guesses of the limit within which K lie are enough: that of the place before (`last`),
+    then as if points lay on a plane, and the middle where that does not lead on.
+    """
+    count, total = len(out), len(apart)
+    zero, half, top = np.float32(0), np.float32(0.5), np.float32(np.inf)
+    below, limit, inside, guess, turns = np.float32(-1), top, total, last, 0
+    while inside != count:
+        if not (below < guess < limit):
+            guess = half * (max(below, zero) + limit)
+            if not (below < guess < limit):
+                break  # neighbouring numbers: several points lie at the very limit
+        found = 0
+        for k in range(total):
+            found += apart[k] <= guess
+        if found < count:
+            below = guess
+        else:
+            limit, inside = guess, found
+        turns += 1
+        if limit == top:
+            guess = np.float32(4) * guess
+        elif turns < 8:
+            guess = limit * np.float32(count + 0.5) / np.float32(inside + 0.5)
+        else:
+            guess = half * (max(below, zero) + limit)
+    room = count  # for points at the very limit: as many as nearer ones leave
+    for k in range(total):
+        room -= apart[k] < limit
+    r, n = frame, 0
+    for start in range(0, total, BLOCK):
+        stop, some = min(start + BLOCK, total), 0
+        for k in range(start, stop):
+            some += apart[k] <= limit
+        if some == 0:
+            continue
+        for k in range(start, stop):
+            if not apart[k] <= limit or (apart[k] == limit and room == 0) or n == count:
+                continue
+            room -= apart[k] == limit
+            x, y, z, p, q, s = points[row[k]]
+            u, v, w = x - r[0, 3], y - r[1, 3], z - r[2, 3]
+            for axis in range(3):
+                out[n, axis] = (u * r[0, axis] + v * r[1, axis] + w * r[2, axis]) * scale
+                out[n, 3 + axis] = p * r[0, axis] + q * r[1, axis] + s * r[2, axis]
+            out[n, 6] = z * scale
+            n += 1
+    out[n:] = np.nan  # of a place that is none
+    return limit if zero < limit < top else last
