@@ -1,7 +1,7 @@
 """A frozen struct of tensors that share their first axis."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import torch
@@ -18,13 +18,13 @@ class Batch:
     """
 
     def __post_init__(self) -> None:
-        sizes = {name: len(value) for name, value in self.tensors().items()}
-        if len(set(sizes.values())) > 1:
+        if len({value.shape[0] for value in self.tensors().values()}) > 1:
+            sizes = {name: len(value) for name, value in self.tensors().items()}
             raise ValueError(f"{type(self).__name__}: fields must share their first axis, found {sizes}")
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the fields by name, in order, without copying."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
     def __len__(self) -> int:
         return len(next(iter(self.tensors().values())))
@@ -47,8 +47,9 @@ class Batch:
         """Join batches along the first axis; at least one is needed."""
         if not batches:
             raise ValueError(f"{cls.__name__}.cat: expected at least one batch, found none")
-        names = [field.name for field in fields(cls)]
-        return cls(**{name: torch.cat([getattr(batch, name) for batch in batches]) for name in names})
+        return cls(
+            **{name: torch.cat([getattr(batch, name) for batch in batches]) for name in cls.__dataclass_fields__}
+        )
 
 
 def _to(value: Tensor, *args: Any, **kwargs: Any) -> Tensor:

@@ -23,6 +23,9 @@ Step = nn.Module | tuple[Tensor, Tensor]
 class Layers(nn.Sequential):
     """Layers in a row. In evaluation on a CPU, a linear layer and the batch norm behind it are one multiplication."""
 
+    _state: Sequence[tuple[int, int]] = ()
+    _kept: Sequence[Step] = ()
+
     def forward(self, *parts: Float[Tensor, "_ _"]) -> Float[Tensor, "N D"]:
         """Return (N, D) for columns of the input in parts; what has fewer rows than N stands for its repetition.
 
@@ -43,7 +46,16 @@ class Layers(nn.Sequential):
         for rows in pieces:
             yield _run(steps, rows)
 
-    def _steps(self) -> list[Step]:
+    def _steps(self) -> Sequence[Step]:
+        if torch.is_grad_enabled() or torch.compiler.is_compiling():
+            return self._joined()
+        # Joining takes as long as multiplying a few hundred rows: it is done again only where a weight has changed.
+        state = [(part.data_ptr(), part._version) for part in self.state_dict(keep_vars=True).values()]
+        if self._state != state:
+            self._state, self._kept = state, self._joined()
+        return self._kept
+
+    def _joined(self) -> list[Step]:
         steps: list[Step] = []
         for layer, following in zip(self, [*list(self)[1:], None], strict=False):
             if isinstance(layer, nn.Linear):

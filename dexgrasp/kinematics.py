@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dexgrasp.errors import DexgraspError
+from dexgrasp.forward_kinematics import chained
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +44,20 @@ class KinematicTree:
         self._constants = torch.from_numpy(np.stack([_constants(record) for record in self.records]))
         self._index = torch.tensor([max(record.index, 0) for record in self.records])
         self._parents = tuple(record.parent for record in self.records)
+        above = [[record.parent, max(record.index, 0)] for record in self.records]
+        self._above = np.array(above).reshape(-1, 2)
+        self._moves = np.array([record.index >= 0 for record in self.records])
         self._cache: dict[tuple[torch.dtype, torch.device], tuple[Tensor, Tensor]] = {}
 
     def poses(self, full: Float[Tensor, "N M"]) -> dict[str, Float[Tensor, "N 4 4"]]:
         """Return base_T_link of every link; gradients flow, dtype and device are those of `full`."""
         constants, index = self._placed(full)
+        differentiable = torch.is_grad_enabled() and full.requires_grad
+        if full.device.type == "cpu" and not differentiable and not torch.compiler.is_compiling():
+            out = torch.empty(len(self.names), len(full), 4, 4, dtype=full.dtype)
+            arrays = full.detach().contiguous().numpy(), constants.numpy()
+            chained(*arrays, self._above, self._moves, out.numpy())
+            return dict(zip(self.names, out.unbind(), strict=True))
         angles = full[:, index] if full.shape[1] else full.new_zeros(len(full), len(index))
         weights = torch.stack([torch.ones_like(angles), angles.sin(), 1 - angles.cos(), angles], dim=-1)
         local = torch.einsum("nlk,lkij->nlij", weights, constants)

@@ -63,10 +63,10 @@ def select(
     `table_T_camera` is the table in the cloud, None where none is seen.
     Candidates are taken in the order of their score and checked lazily, so that good ones cost little.
     """
-    finite = grasps.pose.flatten(1).isfinite().all(1) & grasps.joints.isfinite().all(1)
-    grasps = grasps[finite & (grasps.quality >= selection.min_score)]
-    order = torch.argsort(grasps.quality, descending=True, stable=True)[: selection.candidates]
-    grasps = grasps[order]
+    good = grasps.pose.flatten(1).isfinite().all(1) & grasps.joints.isfinite().all(1)
+    good &= grasps.quality >= selection.min_score
+    order = torch.argsort(torch.where(good, grasps.quality, -torch.inf), descending=True, stable=True)
+    grasps = grasps[order[: min(int(good.sum()), selection.candidates)]]
     shape = _shape(hand) if selection.depth is not None or selection.table is not None else None
     table = table_T_camera if selection.table is not None else None
     points = in_blocks(cloud[:, :3])
@@ -74,17 +74,20 @@ def select(
     for start, stop in _chunks(len(grasps), top_k):
         if len(kept) >= top_k:
             break
-        fresh = torch.arange(start, stop)
+        some = grasps[start:stop]
         if shape is not None and table is not None:
-            grasps.pose[fresh] = on_table(hand, shape, grasps[fresh], table, selection).pose
-        fresh = fresh[~_alike(grasps[fresh], grasps[kept], selection).any(dim=1)]
+            some = on_table(hand, shape, some, table, selection)
+            grasps.pose[start:stop] = some.pose
+        passed = ~_alike(some.pose, grasps.pose[kept], selection).any(dim=1)
+        fresh = passed.nonzero().flatten()
         if shape is not None and len(fresh):
-            fresh = fresh[free(hand, shape, grasps[fresh], points, table, selection)]
-        like, chosen = _alike(grasps[fresh], grasps[fresh], selection).numpy(), list[int]()
+            fresh = fresh[free(hand, shape, some if len(fresh) == len(some) else some[fresh], points, table, selection)]
+        pose = some.pose[fresh]
+        like, chosen = _alike(pose, pose, selection).numpy(), list[int]()
         for row in range(len(fresh)):
             if len(kept) + len(chosen) < top_k and not like[row, chosen].any():
                 chosen.append(row)
-        kept += fresh[chosen].tolist()
+        kept += (start + fresh[chosen]).tolist()
     return grasps[kept]
 
 
@@ -138,12 +141,12 @@ def _chunks(total: int, top_k: int) -> Iterator[tuple[int, int]]:
         start, size = start + size, min(2 * size, 256)
 
 
-def _alike(grasps: Grasps, others: Grasps, selection: Selection) -> Bool[Tensor, "N M"]:
-    """Return which of the grasps are nearly the same as which of the others."""
-    gap = grasps.pose[:, None, :3, 3] - others.pose[None, :, :3, 3]
+def _alike(poses: Float[Tensor, "N 4 4"], others: Float[Tensor, "M 4 4"], selection: Selection) -> Bool[Tensor, "N M"]:
+    """Return which of the hands are at nearly the same place as which of the others."""
+    gap = poses[:, None, :3, 3] - others[None, :, :3, 3]
     alike = torch.linalg.vector_norm(gap, dim=-1) < selection.distance
     row, other = alike.nonzero().unbind(1)
-    turned = rotation_angle(grasps.pose[row, :3, :3], others.pose[other, :3, :3])
+    turned = rotation_angle(poses[row, :3, :3], others[other, :3, :3])
     alike[row, other] = turned < selection.angle
     return alike
 

@@ -11,6 +11,8 @@ from dexgrasp.seeds import torch_stream
 
 TRIALS = 256
 SAMPLE = 2048
+PIECE = 256
+"""Points that are looked at before a plane is given up."""
 
 
 def find_table(
@@ -39,7 +41,7 @@ def find_table(
     offset = -(normal * triples[:, 0]).sum(1)
     normal, offset = torch.where(offset[:, None] < 0, -normal, normal), offset.abs()  # the camera is above
     columns = np.ascontiguousarray(sample.float().numpy().T)
-    counts = _count(columns, torch.column_stack([normal, offset]).float().numpy(), tolerance)
+    counts = _count(columns, torch.column_stack([normal, offset]).float().numpy(), tolerance, below)
     on, behind, before = torch.from_numpy(counts / len(sample)).T
     support = torch.where((behind <= below) & (before >= above), on, 0.0)
     best = int(support.argmax())
@@ -49,10 +51,11 @@ def find_table(
 
 
 @njit(cache=True)
-def _count(rows: np.ndarray, planes: np.ndarray, tolerance: float) -> np.ndarray:
+def _count(rows: np.ndarray, planes: np.ndarray, tolerance: float, below: float) -> np.ndarray:
     """Return (K, 3): points on each plane with agreeing normals, and more than 1 cm behind and before it.
 
-    `rows` (6, P) are positions and normals, `planes` (K, 4) normal and offset; float32.
+    `rows` (6, P) are positions and normals, `planes` (K, 4) normal and offset; float32. A plane that has more than a
+    share `below` behind it is not counted to the end.
     """
     counts = np.empty((len(planes), 3))
     px, py, pz, nx, ny, nz = rows
@@ -60,12 +63,15 @@ def _count(rows: np.ndarray, planes: np.ndarray, tolerance: float) -> np.ndarray
     for k in range(len(planes)):
         a, b, c, d = planes[k]
         on, behind, before = np.int32(0), np.int32(0), np.int32(0)
-        for i in range(len(px)):
-            height = a * px[i] + b * py[i] + c * pz[i] + d
-            along = a * nx[i] + b * ny[i] + c * nz[i]
-            on += np.int32((abs(height) < near) & (along > np.float32(0.9)))
-            behind += np.int32(height < -apart)
-            before += np.int32(height > apart)
+        for start in range(0, len(px), PIECE):
+            for i in range(start, min(start + PIECE, len(px))):
+                height = a * px[i] + b * py[i] + c * pz[i] + d
+                along = a * nx[i] + b * ny[i] + c * nz[i]
+                on += np.int32((abs(height) < near) & (along > np.float32(0.9)))
+                behind += np.int32(height < -apart)
+                before += np.int32(height > apart)
+            if behind > below * len(px):
+                break
         counts[k, 0], counts[k, 1], counts[k, 2] = on, behind, before
     return counts
 

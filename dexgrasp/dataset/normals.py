@@ -19,7 +19,7 @@ from dexgrasp.cells import BITS, Cells, find_cell, make_cells
 
 FEWEST = 10
 """Points of a loose cloud that are used however far they are: where a cloud is thin, one radius holds too few."""
-SPARSE, WIDER = 10, 1.7
+SPARSE, WIDER = 10, 1.5
 """Where cells of one radius hold fewer points than this, so much larger ones are looked through."""
 WIDENINGS = 2
 """Cells are doubled so often for points of which those about them hold too few, before a tree is built."""
