@@ -16,6 +16,10 @@ PIECE = 32
 """Hands whose surroundings are looked at together in evaluation."""
 
 
+WAY = (64, 32)
+"""Widths of the layers on what a fingertip meets on its way."""
+
+
 class Scorer(nn.Module):
     """Logit of the probability that a grasp lifts, from the point's feature, the grasp, and what lies about the hand.
 
@@ -33,6 +37,8 @@ class Scorer(nn.Module):
         around: widths of the layers on each point about the hand, whose maximum is then taken (PointNet).
         tips: widths of the layers on each point about a fingertip, whose maximum and mean are then taken; none: it does
             not look there.
+        sweep: where on its way each fingertip looks for the nearest point, see `dexgrasp.surroundings.swept`; none: it
+            does not.
         upright: what was done to the grasps whose outcome it has learnt, see `dexgrasp.selection.Selection`, rad.
         raised: likewise, m.
     """
@@ -46,6 +52,7 @@ class Scorer(nn.Module):
         hidden: Sequence[int] = (256, 128),
         around: Sequence[int] = (32, 64),
         tips: Sequence[int] = (),
+        sweep: Sequence[float] = (),
         upright: float = 0.0,
         raised: float = 0.0,
     ) -> None:
@@ -57,22 +64,27 @@ class Scorer(nn.Module):
             "hidden": list(hidden),
             "around": list(around),
             "tips": list(tips),
+            "sweep": list(sweep),
             "upright": upright,
             "raised": raised,
         }
         self.around = mlp(7, around[:-1], around[-1])
         self.tips = mlp(7, tips[:-1], tips[-1]) if tips else None
         self.tip = nn.Sequential(nn.Linear(2 * tips[-1], tips[-1]), nn.ReLU()) if tips else None
-        self.spread = FINE if tips else COARSE
+        self.sweep = tuple(sweep)
+        self.way = (
+            nn.Sequential(nn.Linear(7 * len(sweep), WAY[0]), nn.ReLU(), nn.Linear(*WAY), nn.ReLU()) if sweep else None
+        )
+        self.spread = FINE if tips or sweep else COARSE
         """Number of `coarse_points` at which it looks."""
-        felt = len(hand.fingers) * tips[-1] if tips else 0
+        felt = len(hand.fingers) * ((tips[-1] if tips else 0) + (WAY[-1] if sweep else 0))
         self.layers = mlp(channels + around[-1] + felt + 13 + len(hand.joint_names), hidden, 1)
 
     def look(
         self, grasps: Grasps, points: Float[Tensor, "Q 6"]
-    ) -> tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F T 7"]]:
+    ) -> tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F T 7"], Float[Tensor, "N F S 7"]]:
         """Return what it sees about hands and fingertips of a scene's `coarse_points`, `self.spread` of them."""
-        return look(self.hand, grasps, points, AT_TIP if self.tips is not None else 0)
+        return look(self.hand, grasps, points, AT_TIP if self.tips is not None else 0, self.sweep)
 
     def forward(
         self,
@@ -81,6 +93,7 @@ class Scorer(nn.Module):
         grasps: Grasps,
         around: Float[Tensor, "N K 7"],
         tips: Float[Tensor, "N F T 7"],
+        swept: Float[Tensor, "N F S 7"],
     ) -> Float[Tensor, "N"]:
         """Return N logits; `at` is point (m) and normal where each grasp is told, level frame; the rest is of `look`.
 
@@ -94,6 +107,8 @@ class Scorer(nn.Module):
             pieces = self._pieces(self.tips, tips.to(features).flatten(0, 1))
             felt = torch.cat([torch.cat([piece.amax(dim=1), piece.mean(dim=1)], dim=1) for piece in pieces])
             seen.append(self.tip(felt).unflatten(0, (-1, tips.shape[1])).flatten(1))
+        if self.way is not None:
+            seen.append(self.way(swept.to(features).flatten(2)).flatten(1))
         own = torch.cat([part.to(features) for part in seen], dim=1)
         return self.layers(features, own).squeeze(1)
 

@@ -1,5 +1,7 @@
 """What lies about a proposed hand and about its fingertips, as a scorer looks at it."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -8,6 +10,7 @@ from torch import Tensor
 
 from dexgrasp.borrow import borrowed
 from dexgrasp.cells import BITS, Cells, find_cell, make_cells
+from dexgrasp.execution import closing_direction
 from dexgrasp.geometry import transform
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
@@ -19,6 +22,8 @@ FINE, AT_TIP = 2048, 16
 """And of so many by the ones nearest to each fingertip."""
 NEAR = 0.08
 """Side of the cells that are looked through first, m: smaller ones often hold too few."""
+NEAREST_ONE = 0.04
+"""Where but one is wanted."""
 BLOCK = 32
 """Points that are passed over together where none of them is near."""
 REACH, TIP_REACH = 0.1, 0.03
@@ -31,11 +36,12 @@ def coarse_points(cloud: Float[Tensor, "N 6"], count: int = COARSE) -> Float[Ten
 
 
 def look(
-    hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"], count: int = AT_TIP
-) -> tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F T 7"]]:
-    """Return `surroundings` among the first of a scene's `coarse_points`, and `at_tips` among all of them."""
+    hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"], count: int = AT_TIP, sweep: Sequence[float] = ()
+) -> tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F T 7"], Float[Tensor, "N F S 7"]]:
+    """Return `surroundings` among the first of a scene's `coarse_points`, `at_tips` and `swept` among all of them."""
     tips = hand.fingertips(grasps.joints)
-    return surroundings(hand, grasps, points[:COARSE], tips), at_tips(hand, grasps, points, count, tips)
+    near = surroundings(hand, grasps, points[:COARSE], tips)
+    return near, at_tips(hand, grasps, points, count, tips), swept(hand, grasps, points, sweep)
 
 
 def surroundings(
@@ -71,6 +77,24 @@ def at_tips(
     return _seen(every[:, :3, 3], every, points.to(tips), count, TIP_REACH).unflatten(0, tips.shape[:2])
 
 
+def swept(hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"], sweep: Sequence[float]) -> Float[Tensor, "N F S 7"]:
+    """Return the point nearest to each fingertip on its way, in its frame there, as `at_tips` does.
+
+    Of the told posture, closed further by shares `sweep` of the range of each joint that closes a finger; less than 0
+    opens it. Where it ends on what is seen, and how, is then a matter of the few numbers at which a point is near.
+    """
+    if not sweep:
+        return grasps.pose.new_zeros(len(grasps), len(hand.fingers), 0, 7)
+    lower, upper = hand.limits.to(grasps.joints).unbind(1)
+    step = closing_direction(hand).to(grasps.joints) * (upper - lower)
+    joints = grasps.joints[:, None] + torch.tensor(sweep).to(grasps.joints)[:, None] * step
+    tips = hand.fingertips(hand.clamp(joints.flatten(0, 1))).to(grasps.pose).unflatten(0, (-1, len(sweep)))
+    tips = grasps.pose[:, None, None] @ tips
+    every = tips.flatten(0, 2)
+    nearest = _seen(every[:, :3, 3], every, points.to(tips), 1, TIP_REACH)
+    return nearest.reshape(*tips.shape[:3], 7).transpose(1, 2)
+
+
 def _seen(
     middle: Float[Tensor, "N 3"], frame: Float[Tensor, "N 4 4"], points: Float[Tensor, "Q 6"], count: int, reach: float
 ) -> Float[Tensor, "N K 7"]:
@@ -100,7 +124,7 @@ def _compiled(
 ) -> Float[Tensor, "N K 7"]:
     out = torch.empty(len(middle), count, 7)
     one, other, third = (part.detach().contiguous().numpy() for part in (middle, frame, points))
-    cells = make_cells(third[:, :3], NEAR)
+    cells = make_cells(third[:, :3], NEAR if count > 1 else NEAREST_ONE)
     _around(one, other, third[cells.order], cells, np.float32(1 / reach), out.numpy())
     return out
 

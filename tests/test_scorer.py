@@ -27,6 +27,7 @@ from dexgrasp.surroundings import (
     at_tips,
     coarse_points,
     surroundings,
+    swept,
 )
 from dexgrasp.table import find_table
 from dexgrasp.testing.samples import seen
@@ -82,6 +83,24 @@ def middle_and_palm(hand, grasps):
     return transform(grasps.pose, hand.fingertips(grasps.joints)[..., :3, 3].mean(dim=1).float()), palm
 
 
+def test_a_fingertip_on_its_way_sees_the_point_nearest_to_it_there(hand):
+    grasps, points = some(hand), coarse_points(cloud(3000), FINE)
+    sweep = (-0.2, 0.0, 0.3)
+    found = swept(hand, grasps, points, sweep)
+    assert found.shape == (5, len(hand.fingers), 3, 7)
+    torch.testing.assert_close(found[:, :, 1:2], at_tips(hand, grasps, points, 1))  # the posture told
+    lower, upper = hand.limits.float().unbind(1)
+    moves = torch.tensor([0.0 if name == "spread" else 1.0 for name in hand.joint_names])
+    for k, share in enumerate(sweep):
+        joints = torch.minimum(torch.maximum(grasps.joints + share * (upper - lower) * moves, lower), upper)
+        tips = grasps.pose[:, None] @ hand.fingertips(joints)
+        gaps = torch.cdist(tips[..., :3, 3], points[:, :3].expand(5, -1, -1))
+        torch.testing.assert_close(found[:, :, k, :3].norm(dim=-1) * 0.03, gaps.amin(dim=2), atol=1e-5, rtol=0)
+    assert swept(hand, grasps, points, ()).shape == (5, len(hand.fingers), 0, 7)
+    far = grasps.replace(pose=grasps.pose + torch.eye(4) * 0 + torch.tensor([[0, 0, 0, 5.0]] * 3 + [[0.0] * 4]))
+    assert swept(hand, far, points, sweep).isfinite().all()  # where no cell about it holds a point
+
+
 def test_a_scene_turned_about_the_vertical_looks_the_same_to_the_hand(hand):
     grasps, points = some(hand), coarse_points(cloud())
     turn = pose(axis_angle(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(0.7)), torch.tensor([0.3, -0.2, 0.0]))
@@ -113,10 +132,11 @@ def test_fingertips_see_the_points_nearest_to_them_in_their_own_frames(hand):
 def test_a_scorer_tells_by_what_is_at_its_fingertips(hand):
     """In pieces in evaluation as all at once in training's way; it tells otherwise where other points are there."""
     torch.manual_seed(0)
-    scorer, grasps, points = Scorer(hand, 8, tips=(16, 24)).eval(), some(hand, 300), coarse_points(cloud(3000), FINE)
+    scorer = Scorer(hand, 8, tips=(16, 24), sweep=(-0.1, 0.2)).eval()
+    grasps, points = some(hand, 300), coarse_points(cloud(3000), FINE)
     given = torch.randn(300, 8), torch.randn(300, 6), grasps
-    around, tips = scorer.look(grasps, points)
-    told = scorer(*given, around, tips)
+    around, tips, on_way = scorer.look(grasps, points)
+    told = scorer(*given, around, tips, on_way)
     with torch.no_grad():
         whole = scorer.tips(tips.flatten(0, 2)).unflatten(0, (-1, AT_TIP))
         felt = scorer.tip(torch.cat([whole.amax(dim=1), whole.mean(dim=1)], dim=1)).unflatten(0, (300, -1)).flatten(1)
@@ -130,10 +150,12 @@ def test_a_scorer_tells_by_what_is_at_its_fingertips(hand):
             given[1][:, 2:3] / 0.1,
             grasps.joints,
             felt,
+            scorer.way(on_way.flatten(2)).flatten(1),
         ]
         expected = scorer.layers(torch.cat([given[0], *own], dim=1)).squeeze(1)
     torch.testing.assert_close(told, expected, atol=1e-5, rtol=1e-5)
-    assert not torch.allclose(scorer(*given, around, tips.flip(0)), told)
+    assert not torch.allclose(scorer(*given, around, tips.flip(0), on_way), told)
+    assert not torch.allclose(scorer(*given, around, tips, on_way.flip(0)), told)
     blind = Scorer(hand, 8)
     assert blind.spread == COARSE and scorer.spread == FINE and blind.look(grasps, points)[1].shape[2] == 0
 
@@ -218,10 +240,8 @@ def test_it_tries_what_it_would_choose_itself(tmp_path, monkeypatch, tiny):
         assert 1 <= len(part) <= len(seen[seen >= 0].unique()) and not part.lifted.isnan().any()
         with torch.no_grad():
             rest = proposals.propose(path, dataset, [view], told, 0, 1, "some")
-            best = model.scorer(part.features, part.at, scoring._grasps(part), part.around, part.tips).max()
-            assert (
-                best >= model.scorer(rest.features, rest.at, scoring._grasps(rest), rest.around, rest.tips).max() - 1e-4
-            )
+            best, others = (scoring._told_by(model.scorer, each).max() for each in (part, rest))
+            assert best >= others - 1e-4
     model.scorer = None
     save_model(path, model)
     twice = scoring.fit_scorer(model, path, dataset, dataclasses.replace(told, rounds=2), 0, 1)

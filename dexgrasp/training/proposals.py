@@ -50,6 +50,8 @@ class Proposals(Batch):
     """What lies about the hand, see `dexgrasp.surroundings.surroundings`; half precision."""
     tips: Float[Tensor, "N F T 7"]
     """What lies about its fingertips, see `dexgrasp.surroundings.at_tips`; half precision."""
+    swept: Float[Tensor, "N F S 7"]
+    """What is nearest to them on their way, see `dexgrasp.surroundings.swept`; half precision."""
     score: Float[Tensor, "N"]
     """Probability of graspable as the heads tell it."""
     facts: Float[Tensor, "N K"]
@@ -117,11 +119,12 @@ def _of_view(
     kind[found.touched < 2] = 0
     worth = torch.where(found.clear, torch.tensor(settings.clear)[kind], torch.tensor(settings.blocked)[kind])
     holds = found.clear & (held >= max(truth.settings.capacity, 1.0))
-    around, tips = (part.half() for part in look(hand, grasps, coarse, AT_TIP if settings.tips else 0))
+    seen = look(hand, grasps, coarse, AT_TIP if settings.tips else 0, settings.sweep)
+    around, tips, swept = (part.half() for part in seen)
     lifted = torch.full_like(worth, torch.nan)
     tried = len(grasps) if own else settings.verdicts
     lifted[:tried] = _executed(dataset, view, done[:tried], index, settings.protocol)
-    told_by = features[at], cloud[seeds[at]], grasps.pose, grasps.joints, around, tips, grasps.quality
+    told_by = features[at], cloud[seeds[at]], grasps.pose, grasps.joints, around, tips, swept, grasps.quality
     return Proposals(*told_by, facts(hand, done, found), worth, lifted, holds)
 
 

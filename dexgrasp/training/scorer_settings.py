@@ -11,7 +11,7 @@ from dexgrasp.scorer import Scorer
 from dexgrasp.settings import read
 from dexgrasp.simulation.protocol import load_protocol
 
-FROM_START = ("most", "choices", "hidden", "around", "tips", "upright", "raised")
+FROM_START = ("most", "choices", "hidden", "around", "tips", "sweep", "upright", "raised")
 """What, left open, is as the scorer has it that one begins with."""
 
 
@@ -26,6 +26,7 @@ class ScorerSettings:
     hidden: tuple[int, ...] = (256, 128)
     around: tuple[int, ...] = (32, 64)
     tips: tuple[int, ...] = ()
+    sweep: tuple[float, ...] = ()
     upright: float = 0.0
     raised: float = 0.0
     per_view: int = 200
@@ -53,6 +54,10 @@ class ScorerSettings:
         if self.upright < 0 or self.raised < 0:
             found = f"scorer.upright={self.upright}, scorer.raised={self.raised}"
             raise DexgraspError("scorer.upright and scorer.raised of at least 0", found, "set them so; 0: nothing")
+        if not all(-1 <= share <= 1 for share in self.sweep):
+            raise DexgraspError(
+                "scorer.sweep: shares of the joints' ranges, -1..1", str(self.sweep), "set scorer.sweep"
+            )
         if self.verdicts < 0 or self.weight <= 0:
             found = f"{self.verdicts}, {self.weight}"
             raise DexgraspError("scorer.verdicts of at least 0, scorer.weight above it", found, "set them so")

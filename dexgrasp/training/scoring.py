@@ -124,7 +124,7 @@ def _areas(surrogate: Surrogate, tried: Proposals) -> dict[str, Any]:
 @one_thread()
 @torch.no_grad()
 def _told_by(scorer: Scorer, known: Proposals) -> Float[Tensor, "N"]:
-    return scorer(known.features, known.at, _grasps(known), known.around, known.tips)
+    return scorer(known.features, known.at, _grasps(known), known.around, known.tips, known.swept)
 
 
 def _reliable(told: Float[Tensor, "N"], known: Proposals) -> dict[str, Any] | None:
@@ -138,7 +138,7 @@ def _fitted(
 ) -> Scorer:
     """Return a scorer that has learnt what is known, from `start` where it is of the same size."""
     torch.manual_seed(int(stream(seed, "scorer").integers(2**31)))
-    shape = settings.choices, settings.most, settings.hidden, settings.around, settings.tips
+    shape = settings.choices, settings.most, settings.hidden, settings.around, settings.tips, settings.sweep
     options = *shape, settings.upright, settings.raised
     scorer = Scorer(model.hand, known.features.shape[1], *options)
     if start is not None and not settings.anew and _sizes(start) == _sizes(scorer):
@@ -155,7 +155,7 @@ def _sizes(scorer: Scorer) -> dict[str, torch.Size]:
 def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) -> None:
     def loss_of(index: Int[Tensor, "B"]) -> Float[Tensor, ""]:
         rows = known[index]
-        logits = scorer(rows.features, rows.at, _grasps(rows), rows.around, rows.tips)
+        logits = scorer(rows.features, rows.at, _grasps(rows), rows.around, rows.tips, rows.swept)
         tried = ~rows.lifted.isnan()
         wanted = torch.where(tried, rows.lifted, rows.worth)
         return F.binary_cross_entropy_with_logits(logits, wanted, torch.where(tried, settings.weight, 1.0))
