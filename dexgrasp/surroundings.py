@@ -14,7 +14,7 @@ from dexgrasp.execution import closing_direction
 from dexgrasp.geometry import transform
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
-from dexgrasp.sampling import farthest_points
+from dexgrasp.sampling import farthest_points, morton
 
 COARSE, NEAREST = 512, 64
 """Of so many points, spread evenly over the scene, a grasp is judged by the ones nearest to the middle of its tips."""
@@ -22,8 +22,6 @@ FINE, AT_TIP = 2048, 16
 """And of so many by the ones nearest to each fingertip."""
 NEAR = 0.08
 """Side of the cells that are looked through first, m: smaller ones often hold too few."""
-NEAREST_ONE = 0.04
-"""Where but one is wanted."""
 BLOCK = 32
 """Points that are passed over together where none of them is near."""
 REACH, TIP_REACH = 0.1, 0.03
@@ -89,10 +87,9 @@ def swept(hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"], sweep: Seque
     step = closing_direction(hand).to(grasps.joints) * (upper - lower)
     joints = grasps.joints[:, None] + torch.tensor(sweep).to(grasps.joints)[:, None] * step
     tips = hand.fingertips(hand.clamp(joints.flatten(0, 1))).to(grasps.pose).unflatten(0, (-1, len(sweep)))
-    tips = grasps.pose[:, None, None] @ tips
-    every = tips.flatten(0, 2)
-    nearest = _seen(every[:, :3, 3], every, points.to(tips), 1, TIP_REACH)
-    return nearest.reshape(*tips.shape[:3], 7).transpose(1, 2)
+    every = (grasps.pose[:, None, None] @ tips.transpose(1, 2)).flatten(0, 2)  # place after place of one fingertip
+    nearest = _seen(every[:, :3, 3], every, points.to(every), 1, TIP_REACH)
+    return nearest.reshape(len(grasps), len(hand.fingers), len(sweep), 7)
 
 
 def _seen(
@@ -124,7 +121,11 @@ def _compiled(
 ) -> Float[Tensor, "N K 7"]:
     out = torch.empty(len(middle), count, 7)
     one, other, third = (part.detach().contiguous().numpy() for part in (middle, frame, points))
-    cells = make_cells(third[:, :3], NEAR if count > 1 else NEAREST_ONE)
+    if count == 1:
+        order = np.argsort(morton(np.ascontiguousarray(third[:, :3])), kind="stable")
+        _closest(one, other, third[order], np.float32(1 / reach), out.numpy())
+        return out
+    cells = make_cells(third[:, :3], NEAR)
     _around(one, other, third[cells.order], cells, np.float32(1 / reach), out.numpy())
     return out
 
@@ -166,6 +167,50 @@ def _around(
                 e, f, g = x[k] - a, y[k] - b, z[k] - c
                 apart[k] = e * e + f * f + g * g
         last = _copy_nearest(apart[:some], row, points, frame[i], last, scale, out[i])
+
+
+@njit(cache=True)
+def _closest(middle: np.ndarray, frame: np.ndarray, points: np.ndarray, scale: np.float32, out: np.ndarray) -> None:
+    """Fill `out` (N, 1, 7) from points in the order of a curve that fills space.
+
+    Blocks of them are passed over that lie farther off than the point which was nearest to the place before.
+    """
+    middle, frame, points, out = borrowed(middle), borrowed(frame), borrowed(points), borrowed(out)
+    total = len(points)
+    blocks = (total + BLOCK - 1) // BLOCK
+    x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
+    low, high = np.empty((3, blocks), np.float32), np.empty((3, blocks), np.float32)
+    for block in range(blocks):
+        for axis in range(3):
+            part = points[block * BLOCK : (block + 1) * BLOCK, axis]
+            low[axis, block], high[axis, block] = part.min(), part.max()
+    away, apart = np.empty(blocks, np.float32), np.empty(BLOCK, np.float32)
+    best, zero = 0, np.float32(0)
+    for i in range(len(middle)):
+        a, b, c = middle[i]
+        for k in range(blocks):
+            u = max(low[0, k] - a, a - high[0, k], zero)
+            v = max(low[1, k] - b, b - high[1, k], zero)
+            w = max(low[2, k] - c, c - high[2, k], zero)
+            away[k] = u * u + v * v + w * w
+        limit = (x[best] - a) ** 2 + (y[best] - b) ** 2 + (z[best] - c) ** 2
+        for k in range(blocks):
+            if away[k] >= limit:
+                continue
+            start, count = k * BLOCK, min(BLOCK, total - k * BLOCK)
+            for n in range(count):
+                u, v, w = x[start + n] - a, y[start + n] - b, z[start + n] - c
+                apart[n] = u * u + v * v + w * w
+            for n in range(count):
+                if apart[n] < limit:
+                    limit, best = apart[n], start + n
+        r = frame[i]
+        u, v, w = x[best] - r[0, 3], y[best] - r[1, 3], z[best] - r[2, 3]
+        p, q, s = points[best, 3], points[best, 4], points[best, 5]
+        for axis in range(3):
+            out[i, 0, axis] = (u * r[0, axis] + v * r[1, axis] + w * r[2, axis]) * scale
+            out[i, 0, 3 + axis] = p * r[0, axis] + q * r[1, axis] + s * r[2, axis]
+        out[i, 0, 6] = z[best] * scale
 
 
 @njit(cache=True)
