@@ -24,7 +24,9 @@ class Layers(nn.Sequential):
     """Layers in a row. In evaluation on a CPU, a linear layer and the batch norm behind it are one multiplication."""
 
     _state: Sequence[tuple[int, int]] = ()
+    """Memory and version of all weights when `_kept` was made."""
     _kept: Sequence[Step] = ()
+    """What they are when joined."""
 
     def forward(self, *parts: Float[Tensor, "_ _"]) -> Float[Tensor, "N D"]:
         """Return (N, D) for columns of the input in parts; what has fewer rows than N stands for its repetition.
@@ -50,7 +52,10 @@ class Layers(nn.Sequential):
         if torch.is_grad_enabled() or torch.compiler.is_compiling():
             return self._joined()
         # Joining takes as long as multiplying a few hundred rows: it is done again only where a weight has changed.
-        state = [(part.data_ptr(), part._version) for part in self.state_dict(keep_vars=True).values()]
+        parts = self.state_dict(keep_vars=True).values()
+        if any(part.is_inference() for part in parts):  # these do not tell when they change
+            return self._joined()
+        state = [(part.data_ptr(), part._version) for part in parts]
         if self._state != state:
             self._state, self._kept = state, self._joined()
         return self._kept

@@ -53,7 +53,8 @@ class KinematicTree:
         """Return base_T_link of every link; gradients flow, dtype and device are those of `full`."""
         constants, index = self._placed(full)
         differentiable = torch.is_grad_enabled() and full.requires_grad
-        if full.device.type == "cpu" and not differentiable and not torch.compiler.is_compiling():
+        plain = full.device.type == "cpu" and full.dtype in (torch.float32, torch.float64)
+        if plain and not differentiable and not torch.compiler.is_compiling():
             out = torch.empty(len(self.names), len(full), 4, 4, dtype=full.dtype)
             arrays = full.detach().contiguous().numpy(), constants.numpy()
             chained(*arrays, self._above, self._moves, out.numpy())

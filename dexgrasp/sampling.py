@@ -17,8 +17,6 @@ from dexgrasp.cells import BITS, Cells, bounds, find_cell, make_cells
 
 _BUCKET = 64
 """Points per bucket: below it the tests of the boxes dominate, above it the distances."""
-
-
 FEW = 256
 """Among so few points, looking at all of them is quicker than a tree."""
 

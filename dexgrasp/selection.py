@@ -78,10 +78,9 @@ def select(
         if shape is not None and table is not None:
             some = on_table(hand, shape, some, table, selection)
             grasps.pose[start:stop] = some.pose
-        passed = ~_alike(some.pose, grasps.pose[kept], selection).any(dim=1)
-        fresh = passed.nonzero().flatten()
+        fresh = (~_alike(some.pose, grasps.pose[kept], selection).any(dim=1)).nonzero().flatten()
         if shape is not None and len(fresh):
-            fresh = fresh[free(hand, shape, some if len(fresh) == len(some) else some[fresh], points, table, selection)]
+            fresh = fresh[free(hand, shape, some[fresh], points, table, selection)]
         pose = some.pose[fresh]
         like, chosen = _alike(pose, pose, selection).numpy(), list[int]()
         for row in range(len(fresh)):

@@ -204,13 +204,7 @@ def _closest(middle: np.ndarray, frame: np.ndarray, points: np.ndarray, scale: n
             for n in range(count):
                 if apart[n] < limit:
                     limit, best = apart[n], start + n
-        r = frame[i]
-        u, v, w = x[best] - r[0, 3], y[best] - r[1, 3], z[best] - r[2, 3]
-        p, q, s = points[best, 3], points[best, 4], points[best, 5]
-        for axis in range(3):
-            out[i, 0, axis] = (u * r[0, axis] + v * r[1, axis] + w * r[2, axis]) * scale
-            out[i, 0, 3 + axis] = p * r[0, axis] + q * r[1, axis] + s * r[2, axis]
-        out[i, 0, 6] = z[best] * scale
+        _write(points[best], frame[i], scale, out[i, 0])
 
 
 @njit(cache=True)
@@ -253,7 +247,7 @@ def _copy_nearest(
     room = count  # for points at the very limit: as many as nearer ones leave
     for k in range(total):
         room -= apart[k] < limit
-    r, n = frame, 0
+    n = 0
     for start in range(0, total, BLOCK):
         stop, some = min(start + BLOCK, total), 0
         for k in range(start, stop):
@@ -264,12 +258,18 @@ def _copy_nearest(
             if not apart[k] <= limit or (apart[k] == limit and room == 0) or n == count:
                 continue
             room -= apart[k] == limit
-            x, y, z, p, q, s = points[row[k]]
-            u, v, w = x - r[0, 3], y - r[1, 3], z - r[2, 3]
-            for axis in range(3):
-                out[n, axis] = (u * r[0, axis] + v * r[1, axis] + w * r[2, axis]) * scale
-                out[n, 3 + axis] = p * r[0, axis] + q * r[1, axis] + s * r[2, axis]
-            out[n, 6] = z * scale
+            _write(points[row[k]], frame, scale, out[n])
             n += 1
     out[n:] = np.nan  # of a place that is none
     return limit if zero < limit < top else last
+
+
+@njit(cache=True, inline="always")
+def _write(point: np.ndarray, frame: np.ndarray, scale: np.float32, out: np.ndarray) -> None:
+    """Fill `out` (7,) with position and normal of a point (6,) in a frame (4, 4), and its height."""
+    x, y, z = point[0] - frame[0, 3], point[1] - frame[1, 3], point[2] - frame[2, 3]
+    for axis in range(3):
+        a, b, c = frame[0, axis], frame[1, axis], frame[2, axis]
+        out[axis] = (x * a + y * b + z * c) * scale
+        out[3 + axis] = point[3] * a + point[4] * b + point[5] * c
+    out[6] = point[2] * scale

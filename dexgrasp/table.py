@@ -70,7 +70,7 @@ def _count(rows: np.ndarray, planes: np.ndarray, tolerance: float, below: float)
                 on += np.int32((abs(height) < near) & (along > np.float32(0.9)))
                 behind += np.int32(height < -apart)
                 before += np.int32(height > apart)
-            if behind > below * len(px):
+            if behind / len(px) > below:
                 break
         counts[k, 0], counts[k, 1], counts[k, 2] = on, behind, before
     return counts

@@ -224,3 +224,12 @@ def test_yaml_says_couplings_limits_and_efforts_anew():
         load_hand("panda", couplings={"panda_finger_joint2": {"joint": "panda_finger_joint1", "ratio": 2}})
     with pytest.raises(DexgraspError, match="given, visual"):
         load_hand("panda", collision="meshes")
+
+
+@pytest.mark.parametrize(("dtype", "off"), [(torch.float32, 1e-6), (torch.float64, 1e-12), (torch.bfloat16, 0.02)])
+def test_poses_are_the_same_with_and_without_a_gradient(hand, dtype, off):
+    joints = (hand.limits.mean(dim=1) + 0.1 * torch.arange(3)[:, None]).to(dtype)
+    plain, differentiable = hand.link_poses(joints), hand.link_poses(joints.clone().requires_grad_())
+    for link, pose in plain.items():
+        assert pose.dtype == dtype
+        torch.testing.assert_close(pose, differentiable[link].detach(), atol=off, rtol=0)

@@ -210,3 +210,20 @@ def test_parts_of_fewer_rows_stand_for_their_repetition():
     torch.testing.assert_close(beside([few, many, more]), whole)
     assert torch.equal(layers.train()(few, many, more), layers(whole))
     torch.testing.assert_close(layers.eval()(few, many, more), layers(whole))
+
+
+def test_joined_layers_follow_their_weights():
+    torch.manual_seed(0)
+    layers, rows = mlp(5, [8], 3).eval(), torch.randn(20, 5)
+    with torch.no_grad():
+        before = layers(rows)
+        assert torch.equal(layers(rows), before)
+        layers[0].weight.mul_(2)
+        layers[1].running_mean.add_(0.5)
+        torch.testing.assert_close(layers(rows), torch.nn.Sequential.forward(layers, rows))
+        assert not torch.allclose(layers(rows), before)
+        layers.double()
+        torch.testing.assert_close(layers(rows.double()), torch.nn.Sequential.forward(layers, rows.double()))
+    with torch.inference_mode():
+        made = mlp(5, [8], 3).eval()
+        torch.testing.assert_close(made(rows), torch.nn.Sequential.forward(made, rows))

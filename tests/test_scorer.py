@@ -97,8 +97,8 @@ def test_a_fingertip_on_its_way_sees_the_point_nearest_to_it_there(hand):
         gaps = torch.cdist(tips[..., :3, 3], points[:, :3].expand(5, -1, -1))
         torch.testing.assert_close(found[:, :, k, :3].norm(dim=-1) * 0.03, gaps.amin(dim=2), atol=1e-5, rtol=0)
     assert swept(hand, grasps, points, ()).shape == (5, len(hand.fingers), 0, 7)
-    far = grasps.replace(pose=grasps.pose + torch.eye(4) * 0 + torch.tensor([[0, 0, 0, 5.0]] * 3 + [[0.0] * 4]))
-    assert swept(hand, far, points, sweep).isfinite().all()  # where no cell about it holds a point
+    far = grasps.replace(pose=grasps.pose + torch.tensor([[0.0, 0.0, 0.0, 5.0]] * 3 + [[0.0] * 4]))
+    assert swept(hand, far, points, sweep).isfinite().all()
 
 
 def test_a_scene_turned_about_the_vertical_looks_the_same_to_the_hand(hand):
