@@ -83,7 +83,8 @@ def stages(model: GraspNet, points: np.ndarray) -> dict[str, float]:
     lap("heads, decoding")
     if judge is not None:
         answers = len(told) // len(rows)
-        score = judge(rows, level[chosen].repeat(answers, 1), told, *judge.look(told, level[seeds[: judge.spread]]))
+        at = level[chosen].repeat(answers, 1)
+        score = judge(rows, at, told, *judge.look(told, at, level[seeds[: judge.spread]]))
         told = told.replace(quality=score.sigmoid())
         lap("scorer")
     grasps = told.moved(inverse(level_T_camera))

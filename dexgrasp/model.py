@@ -151,7 +151,7 @@ class GraspNet(nn.Module):
             coarse = every[: scorer.spread]
         spread = coarse_points(cloud, scorer.spread) if coarse is None else cloud[coarse]
         at = cloud[seeds].repeat(answers, 1)
-        return grasps.replace(quality=scorer(features, at, grasps, *scorer.look(grasps, spread)).sigmoid())
+        return grasps.replace(quality=scorer(features, at, grasps, *scorer.look(grasps, at, spread)).sigmoid())
 
     def predict(
         self,

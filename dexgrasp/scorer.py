@@ -7,10 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from dexgrasp.extent import NUMBERS
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.heads import Layers, mlp
-from dexgrasp.surroundings import AT_TIP, COARSE, FINE, NEAREST, REACH, look
+from dexgrasp.surroundings import AT_TIP, COARSE, FINE, NEAREST, REACH, Seen, look
 
 PIECE = 32
 """Hands whose surroundings are looked at together in evaluation."""
@@ -39,6 +40,7 @@ class Scorer(nn.Module):
             not look there.
         sweep: where on its way each fingertip looks for the nearest point, see `dexgrasp.surroundings.swept`; none: it
             does not.
+        extent: it is told where the thing lies from the hand and how far it reaches, see `dexgrasp.extent.extents`.
         upright: what was done to the grasps whose outcome it has learnt, see `dexgrasp.selection.Selection`, rad.
         raised: likewise, m.
     """
@@ -53,6 +55,7 @@ class Scorer(nn.Module):
         around: Sequence[int] = (32, 64),
         tips: Sequence[int] = (),
         sweep: Sequence[float] = (),
+        extent: bool = False,
         upright: float = 0.0,
         raised: float = 0.0,
     ) -> None:
@@ -65,6 +68,7 @@ class Scorer(nn.Module):
             "around": list(around),
             "tips": list(tips),
             "sweep": list(sweep),
+            "extent": extent,
             "upright": upright,
             "raised": raised,
         }
@@ -75,16 +79,16 @@ class Scorer(nn.Module):
         self.way = (
             nn.Sequential(nn.Linear(7 * len(sweep), WAY[0]), nn.ReLU(), nn.Linear(*WAY), nn.ReLU()) if sweep else None
         )
-        self.spread = FINE if tips or sweep else COARSE
+        self.extent = extent
+        self.spread = FINE if tips or sweep or extent else COARSE
         """Number of `coarse_points` at which it looks."""
         felt = len(hand.fingers) * ((tips[-1] if tips else 0) + (WAY[-1] if sweep else 0))
+        felt += NUMBERS if extent else 0
         self.layers = mlp(channels + around[-1] + felt + 13 + len(hand.joint_names), hidden, 1)
 
-    def look(
-        self, grasps: Grasps, points: Float[Tensor, "Q 6"]
-    ) -> tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F T 7"], Float[Tensor, "N F S 7"]]:
-        """Return what it sees about hands and fingertips of a scene's `coarse_points`, `self.spread` of them."""
-        return look(self.hand, grasps, points, AT_TIP if self.tips is not None else 0, self.sweep)
+    def look(self, grasps: Grasps, at: Float[Tensor, "N 6"], points: Float[Tensor, "Q 6"]) -> Seen:
+        """Return what it sees of a scene's `coarse_points`, `self.spread` of them; `at` as for `forward`."""
+        return look(self.hand, grasps, at, points, AT_TIP if self.tips is not None else 0, self.sweep, self.extent)
 
     def forward(
         self,
@@ -94,6 +98,7 @@ class Scorer(nn.Module):
         around: Float[Tensor, "N K 7"],
         tips: Float[Tensor, "N F T 7"],
         swept: Float[Tensor, "N F S 7"],
+        extent: Float[Tensor, "N E"],
     ) -> Float[Tensor, "N"]:
         """Return N logits; `at` is point (m) and normal where each grasp is told, level frame; the rest is of `look`.
 
@@ -109,6 +114,7 @@ class Scorer(nn.Module):
             seen.append(self.tip(felt).unflatten(0, (-1, tips.shape[1])).flatten(1))
         if self.way is not None:
             seen.append(self.way(swept.to(features).flatten(2)).flatten(1))
+        seen.append(extent)
         own = torch.cat([part.to(features) for part in seen], dim=1)
         return self.layers(features, own).squeeze(1)
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from dexgrasp.borrow import borrowed
 from dexgrasp.cells import BITS, Cells, find_cell, make_cells
 from dexgrasp.execution import closing_direction
+from dexgrasp.extent import extents
 from dexgrasp.geometry import transform
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
@@ -33,13 +34,26 @@ def coarse_points(cloud: Float[Tensor, "N 6"], count: int = COARSE) -> Float[Ten
     return cloud[farthest_points(cloud[:, :3], min(count, len(cloud)))]
 
 
+Seen = tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F T 7"], Float[Tensor, "N F S 7"], Float[Tensor, "N E"]]
+
+
 def look(
-    hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"], count: int = AT_TIP, sweep: Sequence[float] = ()
-) -> tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F T 7"], Float[Tensor, "N F S 7"]]:
-    """Return `surroundings` among the first of a scene's `coarse_points`, `at_tips` and `swept` among all of them."""
+    hand: Hand,
+    grasps: Grasps,
+    at: Float[Tensor, "N 6"],
+    points: Float[Tensor, "Q 6"],
+    count: int = AT_TIP,
+    sweep: Sequence[float] = (),
+    extent: bool = False,
+) -> Seen:
+    """Return `surroundings` among the first of a scene's `coarse_points`; among all of them `at_tips`, `swept`.
+
+    And, with `extent`, the `dexgrasp.extent.extents` of the things `at` which the grasps are told, (N, 0) without.
+    """
     tips = hand.fingertips(grasps.joints)
     near = surroundings(hand, grasps, points[:COARSE], tips)
-    return near, at_tips(hand, grasps, points, count, tips), swept(hand, grasps, points, sweep)
+    thing = extents(grasps, at, points) if extent else grasps.pose.new_zeros(len(grasps), 0)
+    return near, at_tips(hand, grasps, points, count, tips), swept(hand, grasps, points, sweep), thing
 
 
 def surroundings(

@@ -67,7 +67,9 @@ def test_a_graph_says_what_the_network_says(model, tmp_path, kind, suffix):
 def test_a_scorer_that_looks_at_fingertips_is_exported(model, tmp_path):
     wide = copy.deepcopy(model)
     wide.points = 2600
-    wide.scorer = Scorer(wide.hand, wide.backbone.channels, choices=1, most=100, tips=(8, 8), sweep=(-0.1, 0.1)).eval()
+    wide.scorer = Scorer(
+        wide.hand, wide.backbone.channels, choices=1, most=100, tips=(8, 8), sweep=(-0.1, 0.1), extent=True
+    ).eval()
     views = [view[: 2300 + 100 * number] for number, view in enumerate(level_views(wide, 2))]
     graph = trace(wide, views[0], "grasps")
     assert graph.about["coarse"] == wide.scorer.spread == 2048

@@ -132,11 +132,11 @@ def test_fingertips_see_the_points_nearest_to_them_in_their_own_frames(hand):
 def test_a_scorer_tells_by_what_is_at_its_fingertips(hand):
     """In pieces in evaluation as all at once in training's way; it tells otherwise where other points are there."""
     torch.manual_seed(0)
-    scorer = Scorer(hand, 8, tips=(16, 24), sweep=(-0.1, 0.2)).eval()
+    scorer = Scorer(hand, 8, tips=(16, 24), sweep=(-0.1, 0.2), extent=True).eval()
     grasps, points = some(hand, 300), coarse_points(cloud(3000), FINE)
     given = torch.randn(300, 8), torch.randn(300, 6), grasps
-    around, tips, on_way = scorer.look(grasps, points)
-    told = scorer(*given, around, tips, on_way)
+    around, tips, on_way, extent = scorer.look(grasps, given[1], points)
+    told = scorer(*given, around, tips, on_way, extent)
     with torch.no_grad():
         whole = scorer.tips(tips.flatten(0, 2)).unflatten(0, (-1, AT_TIP))
         felt = scorer.tip(torch.cat([whole.amax(dim=1), whole.mean(dim=1)], dim=1)).unflatten(0, (300, -1)).flatten(1)
@@ -151,13 +151,15 @@ def test_a_scorer_tells_by_what_is_at_its_fingertips(hand):
             grasps.joints,
             felt,
             scorer.way(on_way.flatten(2)).flatten(1),
+            extent,
         ]
         expected = scorer.layers(torch.cat([given[0], *own], dim=1)).squeeze(1)
     torch.testing.assert_close(told, expected, atol=1e-5, rtol=1e-5)
-    assert not torch.allclose(scorer(*given, around, tips.flip(0), on_way), told)
-    assert not torch.allclose(scorer(*given, around, tips, on_way.flip(0)), told)
+    assert not torch.allclose(scorer(*given, around, tips.flip(0), on_way, extent), told)
+    assert not torch.allclose(scorer(*given, around, tips, on_way.flip(0), extent), told)
+    assert not torch.allclose(scorer(*given, around, tips, on_way, extent.flip(0)), told)
     blind = Scorer(hand, 8)
-    assert blind.spread == COARSE and scorer.spread == FINE and blind.look(grasps, points)[1].shape[2] == 0
+    assert blind.spread == COARSE and scorer.spread == FINE and blind.look(grasps, given[1], points)[1].shape[2] == 0
 
 
 def test_few_points_are_enough(hand):
@@ -347,7 +349,8 @@ def test_calibration_makes_probabilities_come_true_and_keeps_the_order(hand):
         slope, shift = platt(logits[:50], all_alike)
         assert slope > 0 and math.isfinite(shift)
     scorer, grasps = Scorer(hand, 8).eval(), some(hand, 64)
-    given = torch.randn(64, 8), torch.randn(64, 6), grasps, *scorer.look(grasps, coarse_points(cloud()))
+    at = torch.randn(64, 6)
+    given = torch.randn(64, 8), at, grasps, *scorer.look(grasps, at, coarse_points(cloud()))
     before = scorer(*given).detach()
     came = torch.bernoulli((before - before.mean()).sigmoid())
     slope, shift = platt(before, came)

@@ -52,6 +52,8 @@ class Proposals(Batch):
     """What lies about its fingertips, see `dexgrasp.surroundings.at_tips`; half precision."""
     swept: Float[Tensor, "N F S 7"]
     """What is nearest to them on their way, see `dexgrasp.surroundings.swept`; half precision."""
+    extent: Float[Tensor, "N E"]
+    """Of the thing at which it is told, see `dexgrasp.extent.extents`; half precision."""
     score: Float[Tensor, "N"]
     """Probability of graspable as the heads tell it."""
     facts: Float[Tensor, "N K"]
@@ -105,7 +107,7 @@ def _of_view(
     if own:
         assert model.scorer is not None
         at = cloud[seeds].repeat(len(told), 1)
-        score = model.scorer(features, at, grasps, *model.scorer.look(grasps, coarse))
+        score = model.scorer(features, at, grasps, *model.scorer.look(grasps, at, coarse))
         rows = _best(model, done.replace(quality=score.sigmoid()), coarse, settings)
     else:
         order = torch.from_numpy(stream(seed, "proposals", index).permutation(len(grasps)))
@@ -119,12 +121,13 @@ def _of_view(
     kind[found.touched < 2] = 0
     worth = torch.where(found.clear, torch.tensor(settings.clear)[kind], torch.tensor(settings.blocked)[kind])
     holds = found.clear & (held >= max(truth.settings.capacity, 1.0))
-    seen = look(hand, grasps, coarse, AT_TIP if settings.tips else 0, settings.sweep)
-    around, tips, swept = (part.half() for part in seen)
+    where = cloud[seeds[at]]
+    seen = look(hand, grasps, where, coarse, AT_TIP if settings.tips else 0, settings.sweep, settings.extent)
+    around, tips, swept, extent = (part.half() for part in seen)
     lifted = torch.full_like(worth, torch.nan)
     tried = len(grasps) if own else settings.verdicts
     lifted[:tried] = _executed(dataset, view, done[:tried], index, settings.protocol)
-    told_by = features[at], cloud[seeds[at]], grasps.pose, grasps.joints, around, tips, swept, grasps.quality
+    told_by = features[at], where, grasps.pose, grasps.joints, around, tips, swept, extent, grasps.quality
     return Proposals(*told_by, facts(hand, done, found), worth, lifted, holds)
 
 

@@ -11,7 +11,7 @@ from dexgrasp.scorer import Scorer
 from dexgrasp.settings import read
 from dexgrasp.simulation.protocol import load_protocol
 
-FROM_START = ("most", "choices", "hidden", "around", "tips", "sweep", "upright", "raised")
+FROM_START = ("most", "choices", "hidden", "around", "tips", "sweep", "extent", "upright", "raised")
 """What, left open, is as the scorer has it that one begins with."""
 
 
@@ -27,6 +27,7 @@ class ScorerSettings:
     around: tuple[int, ...] = (32, 64)
     tips: tuple[int, ...] = ()
     sweep: tuple[float, ...] = ()
+    extent: bool = False
     upright: float = 0.0
     raised: float = 0.0
     per_view: int = 200

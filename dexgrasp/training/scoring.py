@@ -21,10 +21,11 @@ from dexgrasp.reliability import reliability
 from dexgrasp.scorer import Scorer
 from dexgrasp.seeds import stream, torch_stream
 from dexgrasp.statistics import roc_area
+from dexgrasp.surroundings import Seen
 from dexgrasp.threads import one_thread
 from dexgrasp.training.descent import descend
 from dexgrasp.training.proposals import Proposals, propose
-from dexgrasp.training.scorer_settings import ScorerSettings
+from dexgrasp.training.scorer_settings import FROM_START, ScorerSettings
 from dexgrasp.training.surrogate import FEWEST, Surrogate
 
 
@@ -124,7 +125,7 @@ def _areas(surrogate: Surrogate, tried: Proposals) -> dict[str, Any]:
 @one_thread()
 @torch.no_grad()
 def _told_by(scorer: Scorer, known: Proposals) -> Float[Tensor, "N"]:
-    return scorer(known.features, known.at, _grasps(known), known.around, known.tips, known.swept)
+    return scorer(known.features, known.at, _grasps(known), *_seen(known))
 
 
 def _reliable(told: Float[Tensor, "N"], known: Proposals) -> dict[str, Any] | None:
@@ -138,9 +139,8 @@ def _fitted(
 ) -> Scorer:
     """Return a scorer that has learnt what is known, from `start` where it is of the same size."""
     torch.manual_seed(int(stream(seed, "scorer").integers(2**31)))
-    shape = settings.choices, settings.most, settings.hidden, settings.around, settings.tips, settings.sweep
-    options = *shape, settings.upright, settings.raised
-    scorer = Scorer(model.hand, known.features.shape[1], *options)
+    options = {name: getattr(settings, name) for name in FROM_START}
+    scorer = Scorer(model.hand, known.features.shape[1], **options)
     if start is not None and not settings.anew and _sizes(start) == _sizes(scorer):
         scorer.load_state_dict(start.state_dict())
     _fit(scorer, known, settings, seed)
@@ -155,7 +155,7 @@ def _sizes(scorer: Scorer) -> dict[str, torch.Size]:
 def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) -> None:
     def loss_of(index: Int[Tensor, "B"]) -> Float[Tensor, ""]:
         rows = known[index]
-        logits = scorer(rows.features, rows.at, _grasps(rows), rows.around, rows.tips, rows.swept)
+        logits = scorer(rows.features, rows.at, _grasps(rows), *_seen(rows))
         tried = ~rows.lifted.isnan()
         wanted = torch.where(tried, rows.lifted, rows.worth)
         return F.binary_cross_entropy_with_logits(logits, wanted, torch.where(tried, settings.weight, 1.0))
@@ -164,6 +164,10 @@ def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) 
     how = settings.batch, settings.epochs, settings.learning_rate, settings.weight_decay
     descend(scorer, loss_of, len(known), *how, torch_stream(seed, "scorer order"))
     scorer.eval()
+
+
+def _seen(known: Proposals) -> Seen:
+    return known.around, known.tips, known.swept, known.extent
 
 
 def _grasps(known: Proposals) -> Grasps:
