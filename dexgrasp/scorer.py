@@ -40,6 +40,7 @@ class Scorer(nn.Module):
             not look there.
         sweep: where on its way each fingertip looks for the nearest point, see `dexgrasp.surroundings.swept`; none: it
             does not.
+        along: at which places of the distal link it does so, likewise.
         extent: it is told where the thing lies from the hand and how far it reaches, see `dexgrasp.extent.extents`.
         upright: what was done to the grasps whose outcome it has learnt, see `dexgrasp.selection.Selection`, rad.
         raised: likewise, m.
@@ -55,6 +56,7 @@ class Scorer(nn.Module):
         around: Sequence[int] = (32, 64),
         tips: Sequence[int] = (),
         sweep: Sequence[float] = (),
+        along: Sequence[float] = (0.0,),
         extent: bool = False,
         upright: float = 0.0,
         raised: float = 0.0,
@@ -68,6 +70,7 @@ class Scorer(nn.Module):
             "around": list(around),
             "tips": list(tips),
             "sweep": list(sweep),
+            "along": list(along),
             "extent": extent,
             "upright": upright,
             "raised": raised,
@@ -75,10 +78,9 @@ class Scorer(nn.Module):
         self.around = mlp(7, around[:-1], around[-1])
         self.tips = mlp(7, tips[:-1], tips[-1]) if tips else None
         self.tip = nn.Sequential(nn.Linear(2 * tips[-1], tips[-1]), nn.ReLU()) if tips else None
-        self.sweep = tuple(sweep)
-        self.way = (
-            nn.Sequential(nn.Linear(7 * len(sweep), WAY[0]), nn.ReLU(), nn.Linear(*WAY), nn.ReLU()) if sweep else None
-        )
+        self.sweep, self.along = tuple(sweep), tuple(along)
+        met = 7 * len(sweep) * len(along)
+        self.way = nn.Sequential(nn.Linear(met, WAY[0]), nn.ReLU(), nn.Linear(*WAY), nn.ReLU()) if sweep else None
         self.extent = extent
         self.spread = FINE if tips or sweep or extent else COARSE
         """Number of `coarse_points` at which it looks."""
@@ -88,7 +90,8 @@ class Scorer(nn.Module):
 
     def look(self, grasps: Grasps, at: Float[Tensor, "N 6"], points: Float[Tensor, "Q 6"]) -> Seen:
         """Return what it sees of a scene's `coarse_points`, `self.spread` of them; `at` as for `forward`."""
-        return look(self.hand, grasps, at, points, AT_TIP if self.tips is not None else 0, self.sweep, self.extent)
+        count = AT_TIP if self.tips is not None else 0
+        return look(self.hand, grasps, at, points, count, self.sweep, self.along, self.extent)
 
     def forward(
         self,

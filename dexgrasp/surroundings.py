@@ -44,6 +44,7 @@ def look(
     points: Float[Tensor, "Q 6"],
     count: int = AT_TIP,
     sweep: Sequence[float] = (),
+    along: Sequence[float] = (0.0,),
     extent: bool = False,
 ) -> Seen:
     """Return `surroundings` among the first of a scene's `coarse_points`; among all of them `at_tips`, `swept`.
@@ -53,7 +54,7 @@ def look(
     tips = hand.fingertips(grasps.joints)
     near = surroundings(hand, grasps, points[:COARSE], tips)
     thing = extents(grasps, at, points) if extent else grasps.pose.new_zeros(len(grasps), 0)
-    return near, at_tips(hand, grasps, points, count, tips), swept(hand, grasps, points, sweep), thing
+    return near, at_tips(hand, grasps, points, count, tips), swept(hand, grasps, points, sweep, along), thing
 
 
 def surroundings(
@@ -89,21 +90,33 @@ def at_tips(
     return _seen(every[:, :3, 3], every, points.to(tips), count, TIP_REACH).unflatten(0, tips.shape[:2])
 
 
-def swept(hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"], sweep: Sequence[float]) -> Float[Tensor, "N F S 7"]:
-    """Return the point nearest to each fingertip on its way, in its frame there, as `at_tips` does.
+def swept(
+    hand: Hand,
+    grasps: Grasps,
+    points: Float[Tensor, "Q 6"],
+    sweep: Sequence[float],
+    along: Sequence[float] = (0.0,),
+) -> Float[Tensor, "N F S 7"]:
+    """Return the point nearest to each place of a finger on its way, in the fingertip's frame, moved there.
 
     Of the told posture, closed further by shares `sweep` of the range of each joint that closes a finger; less than 0
     opens it. Where it ends on what is seen, and how, is then a matter of the few numbers at which a point is near.
+    `along` are places on the distal link, shares of the way from the fingertip's centre (0) to the outer joint (1); in
+    S all places of the sweep come first with the first, then with the second, ...
     """
     if not sweep:
         return grasps.pose.new_zeros(len(grasps), len(hand.fingers), 0, 7)
+    places = len(along) * len(sweep)
     lower, upper = hand.limits.to(grasps.joints).unbind(1)
     step = closing_direction(hand).to(grasps.joints) * (upper - lower)
     joints = grasps.joints[:, None] + torch.tensor(sweep).to(grasps.joints)[:, None] * step
     tips = hand.fingertips(hand.clamp(joints.flatten(0, 1))).to(grasps.pose).unflatten(0, (-1, len(sweep)))
-    every = (grasps.pose[:, None, None] @ tips.transpose(1, 2)).flatten(0, 2)  # place after place of one fingertip
+    tips = (grasps.pose[:, None, None] @ tips.transpose(1, 2)).unsqueeze(2).repeat(1, 1, len(along), 1, 1, 1)
+    inward = torch.tensor([[share * finger.reach for share in along] for finger in hand.fingers]).to(tips)
+    tips[..., :3, 3] += inward[:, :, None, None] * tips[..., :3, 0]
+    every = tips.flatten(0, 3)  # place after place of one finger
     nearest = _seen(every[:, :3, 3], every, points.to(every), 1, TIP_REACH)
-    return nearest.reshape(len(grasps), len(hand.fingers), len(sweep), 7)
+    return nearest.reshape(len(grasps), len(hand.fingers), places, 7)
 
 
 def _seen(

@@ -68,7 +68,14 @@ def test_a_scorer_that_looks_at_fingertips_is_exported(model, tmp_path):
     wide = copy.deepcopy(model)
     wide.points = 2600
     wide.scorer = Scorer(
-        wide.hand, wide.backbone.channels, choices=1, most=100, tips=(8, 8), sweep=(-0.1, 0.1), extent=True
+        wide.hand,
+        wide.backbone.channels,
+        choices=1,
+        most=100,
+        tips=(8, 8),
+        sweep=(-0.1, 0.1),
+        along=(0.0, 1.0),
+        extent=True,
     ).eval()
     views = [view[: 2300 + 100 * number] for number, view in enumerate(level_views(wide, 2))]
     graph = trace(wide, views[0], "grasps")

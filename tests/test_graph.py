@@ -28,7 +28,14 @@ def network(representation: str, hand: str = "barrett") -> GraspNet:
     torch.manual_seed(0)
     model = build_model(composed, points=1000)
     model.scorer = Scorer(
-        model.hand, model.backbone.channels, choices=2, most=40, tips=(8, 8), sweep=(-0.1, 0.1), extent=True
+        model.hand,
+        model.backbone.channels,
+        choices=2,
+        most=40,
+        tips=(8, 8),
+        sweep=(-0.1, 0.1),
+        along=(0.0, 1.0),
+        extent=True,
     )
     return model.eval()
 

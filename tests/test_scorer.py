@@ -96,6 +96,13 @@ def test_a_fingertip_on_its_way_sees_the_point_nearest_to_it_there(hand):
         tips = grasps.pose[:, None] @ hand.fingertips(joints)
         gaps = torch.cdist(tips[..., :3, 3], points[:, :3].expand(5, -1, -1))
         torch.testing.assert_close(found[:, :, k, :3].norm(dim=-1) * 0.03, gaps.amin(dim=2), atol=1e-5, rtol=0)
+    inner = swept(hand, grasps, points, sweep, (0.0, 1.0))
+    torch.testing.assert_close(inner[:, :, :3], found)
+    outer = hand.fingers[0].outer_joint.float()  # as far from what is seen as the outer joint itself
+    joints = torch.minimum(torch.maximum(grasps.joints - 0.2 * (upper - lower) * moves, lower), upper)
+    link = grasps.pose @ hand.link_poses(joints)[hand.fingers[0].link]
+    apart = torch.cdist(transform(link, outer.expand(5, 3)), points[:, :3]).amin(dim=1)
+    torch.testing.assert_close(inner[:, 0, 3, :3].norm(dim=-1) * 0.03, apart, atol=1e-5, rtol=0)
     assert swept(hand, grasps, points, ()).shape == (5, len(hand.fingers), 0, 7)
     far = grasps.replace(pose=grasps.pose + torch.tensor([[0.0, 0.0, 0.0, 5.0]] * 3 + [[0.0] * 4]))
     assert swept(hand, far, points, sweep).isfinite().all()
@@ -132,7 +139,7 @@ def test_fingertips_see_the_points_nearest_to_them_in_their_own_frames(hand):
 def test_a_scorer_tells_by_what_is_at_its_fingertips(hand):
     """In pieces in evaluation as all at once in training's way; it tells otherwise where other points are there."""
     torch.manual_seed(0)
-    scorer = Scorer(hand, 8, tips=(16, 24), sweep=(-0.1, 0.2), extent=True).eval()
+    scorer = Scorer(hand, 8, tips=(16, 24), sweep=(-0.1, 0.2), along=(0.0, 0.6), extent=True).eval()
     grasps, points = some(hand, 300), coarse_points(cloud(3000), FINE)
     given = torch.randn(300, 8), torch.randn(300, 6), grasps
     around, tips, on_way, extent = scorer.look(grasps, given[1], points)
@@ -320,6 +327,9 @@ def test_settings_are_checked():
         {"rounds": 0},
         {"upright": -0.1},
         {"views": 0},
+        {"sweep": (0.0, 1.2)},
+        {"along": (-3.0,)},
+        {"along": ()},
         {"clear": (0.1, 0.2)},
         {"blocked": (0.1, 0.2, 0.3, 1.5)},
     ):

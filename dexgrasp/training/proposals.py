@@ -122,7 +122,8 @@ def _of_view(
     worth = torch.where(found.clear, torch.tensor(settings.clear)[kind], torch.tensor(settings.blocked)[kind])
     holds = found.clear & (held >= max(truth.settings.capacity, 1.0))
     where = cloud[seeds[at]]
-    seen = look(hand, grasps, where, coarse, AT_TIP if settings.tips else 0, settings.sweep, settings.extent)
+    count = AT_TIP if settings.tips else 0
+    seen = look(hand, grasps, where, coarse, count, settings.sweep, settings.along, settings.extent)
     around, tips, swept, extent = (part.half() for part in seen)
     lifted = torch.full_like(worth, torch.nan)
     tried = len(grasps) if own else settings.verdicts

@@ -11,7 +11,7 @@ from dexgrasp.scorer import Scorer
 from dexgrasp.settings import read
 from dexgrasp.simulation.protocol import load_protocol
 
-FROM_START = ("most", "choices", "hidden", "around", "tips", "sweep", "extent", "upright", "raised")
+FROM_START = ("most", "choices", "hidden", "around", "tips", "sweep", "along", "extent", "upright", "raised")
 """What, left open, is as the scorer has it that one begins with."""
 
 
@@ -27,6 +27,7 @@ class ScorerSettings:
     around: tuple[int, ...] = (32, 64)
     tips: tuple[int, ...] = ()
     sweep: tuple[float, ...] = ()
+    along: tuple[float, ...] = (0.0,)
     extent: bool = False
     upright: float = 0.0
     raised: float = 0.0
@@ -55,10 +56,12 @@ class ScorerSettings:
         if self.upright < 0 or self.raised < 0:
             found = f"scorer.upright={self.upright}, scorer.raised={self.raised}"
             raise DexgraspError("scorer.upright and scorer.raised of at least 0", found, "set them so; 0: nothing")
-        if not all(-1 <= share <= 1 for share in self.sweep):
-            raise DexgraspError(
-                "scorer.sweep: shares of the joints' ranges, -1..1", str(self.sweep), "set scorer.sweep"
-            )
+        for name, what in (("sweep", "the joints' ranges"), ("along", "the distal link's length")):
+            found = getattr(self, name)
+            if not all(-1 <= share <= 1 for share in found):
+                raise DexgraspError(f"scorer.{name}: shares of {what}, -1..1", str(found), f"set scorer.{name}")
+        if not self.along:
+            raise DexgraspError("scorer.along: one place at least", "none", "set scorer.along; [0.0]: the fingertip")
         if self.verdicts < 0 or self.weight <= 0:
             found = f"{self.verdicts}, {self.weight}"
             raise DexgraspError("scorer.verdicts of at least 0, scorer.weight above it", found, "set them so")
