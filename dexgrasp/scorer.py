@@ -11,7 +11,7 @@ from dexgrasp.extent import NUMBERS
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.heads import Layers, mlp
-from dexgrasp.surroundings import AT_TIP, COARSE, FINE, NEAREST, REACH, Seen, look
+from dexgrasp.surroundings import COARSE, FINE, NEAREST, REACH, Seen, look
 
 PIECE = 32
 """Hands whose surroundings are looked at together in evaluation."""
@@ -24,7 +24,7 @@ WAY = (64, 32)
 class Scorer(nn.Module):
     """Logit of the probability that a grasp lifts, from the point's feature, the grasp, and what lies about the hand.
 
-    Whether it lifts is decided where fingertips meet the object: each sees the points about it in its own frame.
+    Whether it lifts is decided where fingers meet the object: each sees, in its own frame, what is nearest on its way.
 
     Labels say which points some known grasp touches; they do not say whether what the network tells there is any good.
     This is trained on exactly that: on the network's own grasps, closed on the true objects.
@@ -36,8 +36,6 @@ class Scorer(nn.Module):
         most: number of points, the most graspable as the heads think, whose grasps it looks at.
         hidden: widths of the hidden layers.
         around: widths of the layers on each point about the hand, whose maximum is then taken (PointNet).
-        tips: widths of the layers on each point about a fingertip, whose maximum and mean are then taken; none: it does
-            not look there.
         sweep: where on its way each fingertip looks for the nearest point, see `dexgrasp.surroundings.swept`; none: it
             does not.
         along: at which places of the distal link it does so, likewise.
@@ -54,7 +52,6 @@ class Scorer(nn.Module):
         most: int = 256,
         hidden: Sequence[int] = (256, 128),
         around: Sequence[int] = (32, 64),
-        tips: Sequence[int] = (),
         sweep: Sequence[float] = (),
         along: Sequence[float] = (0.0,),
         extent: bool = False,
@@ -68,7 +65,6 @@ class Scorer(nn.Module):
             "most": most,
             "hidden": list(hidden),
             "around": list(around),
-            "tips": list(tips),
             "sweep": list(sweep),
             "along": list(along),
             "extent": extent,
@@ -76,22 +72,18 @@ class Scorer(nn.Module):
             "raised": raised,
         }
         self.around = mlp(7, around[:-1], around[-1])
-        self.tips = mlp(7, tips[:-1], tips[-1]) if tips else None
-        self.tip = nn.Sequential(nn.Linear(2 * tips[-1], tips[-1]), nn.ReLU()) if tips else None
         self.sweep, self.along = tuple(sweep), tuple(along)
         met = 7 * len(sweep) * len(along)
         self.way = nn.Sequential(nn.Linear(met, WAY[0]), nn.ReLU(), nn.Linear(*WAY), nn.ReLU()) if sweep else None
         self.extent = extent
-        self.spread = FINE if tips or sweep or extent else COARSE
+        self.spread = FINE if sweep or extent else COARSE
         """Number of `coarse_points` at which it looks."""
-        felt = len(hand.fingers) * ((tips[-1] if tips else 0) + (WAY[-1] if sweep else 0))
-        felt += NUMBERS if extent else 0
+        felt = len(hand.fingers) * (WAY[-1] if sweep else 0) + (NUMBERS if extent else 0)
         self.layers = mlp(channels + around[-1] + felt + 13 + len(hand.joint_names), hidden, 1)
 
     def look(self, grasps: Grasps, at: Float[Tensor, "N 6"], points: Float[Tensor, "Q 6"]) -> Seen:
         """Return what it sees of a scene's `coarse_points`, `self.spread` of them; `at` as for `forward`."""
-        count = AT_TIP if self.tips is not None else 0
-        return look(self.hand, grasps, at, points, count, self.sweep, self.along, self.extent)
+        return look(self.hand, grasps, at, points, self.sweep, self.along, self.extent)
 
     def forward(
         self,
@@ -99,7 +91,6 @@ class Scorer(nn.Module):
         at: Float[Tensor, "N 6"],
         grasps: Grasps,
         around: Float[Tensor, "N K 7"],
-        tips: Float[Tensor, "N F T 7"],
         swept: Float[Tensor, "N F S 7"],
         extent: Float[Tensor, "N E"],
     ) -> Float[Tensor, "N"]:
@@ -111,10 +102,6 @@ class Scorer(nn.Module):
         turned = grasps.pose[:, :3, :2].flatten(1)
         near = torch.cat([piece.amax(dim=1) for piece in self._pieces(self.around, around.to(features))])
         seen = [near, offset, turned, at[:, 3:], at[:, 2:3] / REACH, grasps.joints]
-        if self.tips is not None and self.tip is not None:
-            pieces = self._pieces(self.tips, tips.to(features).flatten(0, 1))
-            felt = torch.cat([torch.cat([piece.amax(dim=1), piece.mean(dim=1)], dim=1) for piece in pieces])
-            seen.append(self.tip(felt).unflatten(0, (-1, tips.shape[1])).flatten(1))
         if self.way is not None:
             seen.append(self.way(swept.to(features).flatten(2)).flatten(1))
         seen.append(extent)

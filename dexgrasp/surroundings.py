@@ -1,4 +1,4 @@
-"""What lies about a proposed hand and about its fingertips, as a scorer looks at it."""
+"""What lies about a proposed hand and on the way of its fingers, as a scorer looks at it."""
 
 from collections.abc import Sequence
 
@@ -19,8 +19,8 @@ from dexgrasp.sampling import farthest_points, morton
 
 COARSE, NEAREST = 512, 64
 """Of so many points, spread evenly over the scene, a grasp is judged by the ones nearest to the middle of its tips."""
-FINE, AT_TIP = 2048, 16
-"""And of so many by the ones nearest to each fingertip."""
+FINE = 2048
+"""And of so many by the ones nearest to each finger on its way."""
 NEAR = 0.08
 """Side of the cells that are looked through first, m: smaller ones often hold too few."""
 BLOCK = 32
@@ -34,7 +34,7 @@ def coarse_points(cloud: Float[Tensor, "N 6"], count: int = COARSE) -> Float[Ten
     return cloud[farthest_points(cloud[:, :3], min(count, len(cloud)))]
 
 
-Seen = tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F T 7"], Float[Tensor, "N F S 7"], Float[Tensor, "N E"]]
+Seen = tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F S 7"], Float[Tensor, "N E"]]
 
 
 def look(
@@ -42,52 +42,29 @@ def look(
     grasps: Grasps,
     at: Float[Tensor, "N 6"],
     points: Float[Tensor, "Q 6"],
-    count: int = AT_TIP,
     sweep: Sequence[float] = (),
     along: Sequence[float] = (0.0,),
     extent: bool = False,
 ) -> Seen:
-    """Return `surroundings` among the first of a scene's `coarse_points`; among all of them `at_tips`, `swept`.
+    """Return `surroundings` among the first of a scene's `coarse_points` and `swept` among all of them.
 
     And, with `extent`, the `dexgrasp.extent.extents` of the things `at` which the grasps are told, (N, 0) without.
     """
-    tips = hand.fingertips(grasps.joints)
-    near = surroundings(hand, grasps, points[:COARSE], tips)
+    near = surroundings(hand, grasps, points[:COARSE])
     thing = extents(grasps, at, points) if extent else grasps.pose.new_zeros(len(grasps), 0)
-    return near, at_tips(hand, grasps, points, count, tips), swept(hand, grasps, points, sweep, along), thing
+    return near, swept(hand, grasps, points, sweep, along), thing
 
 
-def surroundings(
-    hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"], tips: Float[Tensor, "N F 4 4"] | None = None
-) -> Float[Tensor, "N K 7"]:
+def surroundings(hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"]) -> Float[Tensor, "N K 7"]:
     """Return the `points` about each hand: position and normal in its palm's frame, height in the level one; scaled.
 
-    The K nearest to the middle of its tips, in no particular order. `tips` is `hand.fingertips` of the grasps' joints.
+    The K nearest to the middle of its tips, in no particular order.
     """
     points = points.to(grasps.pose)
-    tips = hand.fingertips(grasps.joints) if tips is None else tips
+    tips = hand.fingertips(grasps.joints)
     middle = transform(grasps.pose, tips[..., :3, 3].mean(dim=1).to(grasps.pose))
     palm = grasps.pose @ hand.base_T_palm.to(grasps.pose)
     return _seen(middle, palm, points, NEAREST, REACH)
-
-
-def at_tips(
-    hand: Hand,
-    grasps: Grasps,
-    points: Float[Tensor, "Q 6"],
-    count: int = AT_TIP,
-    tips: Float[Tensor, "N F 4 4"] | None = None,
-) -> Float[Tensor, "N F T 7"]:
-    """Return the `count` points nearest to each fingertip's centre, in its frame (`Hand.fingertips`), scaled.
-
-    Position, normal and height in the level frame, in no particular order. `tips` as for `surroundings`.
-    """
-    if not count:
-        return grasps.pose.new_zeros(len(grasps), len(hand.fingers), 0, 7)
-    tips = hand.fingertips(grasps.joints) if tips is None else tips
-    tips = grasps.pose[:, None] @ tips.to(grasps.pose)
-    every = tips.flatten(0, 1)
-    return _seen(every[:, :3, 3], every, points.to(tips), count, TIP_REACH).unflatten(0, tips.shape[:2])
 
 
 def swept(
@@ -97,7 +74,9 @@ def swept(
     sweep: Sequence[float],
     along: Sequence[float] = (0.0,),
 ) -> Float[Tensor, "N F S 7"]:
-    """Return the point nearest to each place of a finger on its way, in the fingertip's frame, moved there.
+    """Return the point nearest to each place of a finger on its way, in the fingertip's frame, moved there; scaled.
+
+    Position, normal and height in the level frame.
 
     Of the told posture, closed further by shares `sweep` of the range of each joint that closes a finger; less than 0
     opens it. Where it ends on what is seen, and how, is then a matter of the few numbers at which a point is near.

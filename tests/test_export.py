@@ -64,7 +64,7 @@ def test_a_graph_says_what_the_network_says(model, tmp_path, kind, suffix):
     assert worse.beyond == worse.rows
 
 
-def test_a_scorer_that_looks_at_fingertips_is_exported(model, tmp_path):
+def test_a_scorer_that_follows_fingers_is_exported(model, tmp_path):
     wide = copy.deepcopy(model)
     wide.points = 2600
     wide.scorer = Scorer(
@@ -72,7 +72,6 @@ def test_a_scorer_that_looks_at_fingertips_is_exported(model, tmp_path):
         wide.backbone.channels,
         choices=1,
         most=100,
-        tips=(8, 8),
         sweep=(-0.1, 0.1),
         along=(0.0, 1.0),
         extent=True,

@@ -32,7 +32,6 @@ def network(representation: str, hand: str = "barrett") -> GraspNet:
         model.backbone.channels,
         choices=2,
         most=40,
-        tips=(8, 8),
         sweep=(-0.1, 0.1),
         along=(0.0, 1.0),
         extent=True,

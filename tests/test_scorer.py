@@ -19,12 +19,10 @@ from dexgrasp.scorer import Scorer, platt
 from dexgrasp.selection import Selection
 from dexgrasp.statistics import roc_area
 from dexgrasp.surroundings import (
-    AT_TIP,
     COARSE,
     FINE,
     NEAREST,
     around_reference,
-    at_tips,
     coarse_points,
     surroundings,
     swept,
@@ -88,7 +86,9 @@ def test_a_fingertip_on_its_way_sees_the_point_nearest_to_it_there(hand):
     sweep = (-0.2, 0.0, 0.3)
     found = swept(hand, grasps, points, sweep)
     assert found.shape == (5, len(hand.fingers), 3, 7)
-    torch.testing.assert_close(found[:, :, 1:2], at_tips(hand, grasps, points, 1))  # the posture told
+    tips = (grasps.pose[:, None] @ hand.fingertips(grasps.joints).float()).flatten(0, 1)  # at the posture told
+    told = around_reference(tips[:, :3, 3], tips, points, 1, 0.03)
+    torch.testing.assert_close(found[:, :, 1], told.reshape(5, -1, 7), atol=1e-5, rtol=1e-5)
     lower, upper = hand.limits.float().unbind(1)
     moves = torch.tensor([0.0 if name == "spread" else 1.0 for name in hand.joint_names])
     for k, share in enumerate(sweep):
@@ -117,36 +117,15 @@ def test_a_scene_turned_about_the_vertical_looks_the_same_to_the_hand(hand):
     assert torch.cdist(here.double(), there.double()).amin(dim=2).max() < 1e-4
 
 
-def test_fingertips_see_the_points_nearest_to_them_in_their_own_frames(hand):
-    grasps, points = some(hand), coarse_points(cloud(3000), FINE)
-    seen_there = at_tips(hand, grasps, points)
-    assert seen_there.shape == (5, len(hand.fingers), AT_TIP, 7)
-    for row in range(5):
-        for finger in range(len(hand.fingers)):
-            tip = (grasps.pose[row] @ hand.fingertips(grasps.joints[row : row + 1])[0, finger].float()).double()
-            nearest = (points[:, :3] - tip[:3, 3]).norm(dim=1).argsort()[:AT_TIP]
-            local = (torch.linalg.inv(tip)[:3, :3] @ (points[nearest, :3].double() - tip[:3, 3]).T).T / 0.03
-            normals = (torch.linalg.inv(tip)[:3, :3] @ points[nearest, 3:].double().T).T
-            expected = torch.cat([local, normals, points[nearest, 2:3].double() / 0.03], dim=1)
-            found = seen_there[row, finger].double()
-            matched = torch.cdist(expected, found).argmin(dim=1)
-            assert len(matched.unique()) == AT_TIP
-            torch.testing.assert_close(found[matched], expected, atol=1e-3, rtol=0)
-    assert at_tips(hand, grasps, points, 0).shape == (5, len(hand.fingers), 0, 7)
-    assert at_tips(hand, grasps, points[:7]).shape == (5, len(hand.fingers), 7, 7)
-
-
-def test_a_scorer_tells_by_what_is_at_its_fingertips(hand):
-    """In pieces in evaluation as all at once in training's way; it tells otherwise where other points are there."""
+def test_a_scorer_tells_by_what_its_fingers_meet(hand):
+    """In pieces in evaluation as all at once in training's way; it tells otherwise where other points are."""
     torch.manual_seed(0)
-    scorer = Scorer(hand, 8, tips=(16, 24), sweep=(-0.1, 0.2), along=(0.0, 0.6), extent=True).eval()
+    scorer = Scorer(hand, 8, sweep=(-0.1, 0.2), along=(0.0, 0.6), extent=True).eval()
     grasps, points = some(hand, 300), coarse_points(cloud(3000), FINE)
     given = torch.randn(300, 8), torch.randn(300, 6), grasps
-    around, tips, on_way, extent = scorer.look(grasps, given[1], points)
-    told = scorer(*given, around, tips, on_way, extent)
+    around, on_way, extent = scorer.look(grasps, given[1], points)
+    told = scorer(*given, around, on_way, extent)
     with torch.no_grad():
-        whole = scorer.tips(tips.flatten(0, 2)).unflatten(0, (-1, AT_TIP))
-        felt = scorer.tip(torch.cat([whole.amax(dim=1), whole.mean(dim=1)], dim=1)).unflatten(0, (300, -1)).flatten(1)
         near = scorer.around(around.flatten(0, 1)).unflatten(0, (300, -1)).amax(dim=1)
         offset = (grasps.pose[:, :3, 3] - given[1][:, :3]) / 0.1
         own = [
@@ -156,15 +135,13 @@ def test_a_scorer_tells_by_what_is_at_its_fingertips(hand):
             given[1][:, 3:],
             given[1][:, 2:3] / 0.1,
             grasps.joints,
-            felt,
             scorer.way(on_way.flatten(2)).flatten(1),
             extent,
         ]
         expected = scorer.layers(torch.cat([given[0], *own], dim=1)).squeeze(1)
     torch.testing.assert_close(told, expected, atol=1e-5, rtol=1e-5)
-    assert not torch.allclose(scorer(*given, around, tips.flip(0), on_way, extent), told)
-    assert not torch.allclose(scorer(*given, around, tips, on_way.flip(0), extent), told)
-    assert not torch.allclose(scorer(*given, around, tips, on_way, extent.flip(0)), told)
+    assert not torch.allclose(scorer(*given, around, on_way.flip(0), extent), told)
+    assert not torch.allclose(scorer(*given, around, on_way, extent.flip(0)), told)
     blind = Scorer(hand, 8)
     assert blind.spread == COARSE and scorer.spread == FINE and blind.look(grasps, given[1], points)[1].shape[2] == 0
 

@@ -23,7 +23,7 @@ from dexgrasp.scene import View
 from dexgrasp.seeds import stream
 from dexgrasp.selection import free, on_table, select
 from dexgrasp.simulation.protocol import load_protocol
-from dexgrasp.surroundings import AT_TIP, FINE, coarse_points, look
+from dexgrasp.surroundings import FINE, coarse_points, look
 from dexgrasp.threads import one_thread
 from dexgrasp.training.scorer_settings import ScorerSettings
 from dexgrasp.training.surrogate import facts
@@ -48,10 +48,8 @@ class Proposals(Batch):
     joints: Float[Tensor, "N J"]
     around: Float[Tensor, "N K 7"]
     """What lies about the hand, see `dexgrasp.surroundings.surroundings`; half precision."""
-    tips: Float[Tensor, "N F T 7"]
-    """What lies about its fingertips, see `dexgrasp.surroundings.at_tips`; half precision."""
     swept: Float[Tensor, "N F S 7"]
-    """What is nearest to them on their way, see `dexgrasp.surroundings.swept`; half precision."""
+    """What is nearest to its fingers on their way, see `dexgrasp.surroundings.swept`; half precision."""
     extent: Float[Tensor, "N E"]
     """Of the thing at which it is told, see `dexgrasp.extent.extents`; half precision."""
     score: Float[Tensor, "N"]
@@ -122,13 +120,12 @@ def _of_view(
     worth = torch.where(found.clear, torch.tensor(settings.clear)[kind], torch.tensor(settings.blocked)[kind])
     holds = found.clear & (held >= max(truth.settings.capacity, 1.0))
     where = cloud[seeds[at]]
-    count = AT_TIP if settings.tips else 0
-    seen = look(hand, grasps, where, coarse, count, settings.sweep, settings.along, settings.extent)
-    around, tips, swept, extent = (part.half() for part in seen)
+    seen = look(hand, grasps, where, coarse, settings.sweep, settings.along, settings.extent)
+    around, swept, extent = (part.half() for part in seen)
     lifted = torch.full_like(worth, torch.nan)
     tried = len(grasps) if own else settings.verdicts
     lifted[:tried] = _executed(dataset, view, done[:tried], index, settings.protocol)
-    told_by = features[at], where, grasps.pose, grasps.joints, around, tips, swept, extent, grasps.quality
+    told_by = features[at], where, grasps.pose, grasps.joints, around, swept, extent, grasps.quality
     return Proposals(*told_by, facts(hand, done, found), worth, lifted, holds)
 
 

@@ -11,7 +11,7 @@ from dexgrasp.scorer import Scorer
 from dexgrasp.settings import read
 from dexgrasp.simulation.protocol import load_protocol
 
-FROM_START = ("most", "choices", "hidden", "around", "tips", "sweep", "along", "extent", "upright", "raised")
+FROM_START = ("most", "choices", "hidden", "around", "sweep", "along", "extent", "upright", "raised")
 """What, left open, is as the scorer has it that one begins with."""
 
 
@@ -25,7 +25,6 @@ class ScorerSettings:
     most: int = 256
     hidden: tuple[int, ...] = (256, 128)
     around: tuple[int, ...] = (32, 64)
-    tips: tuple[int, ...] = ()
     sweep: tuple[float, ...] = ()
     along: tuple[float, ...] = (0.0,)
     extent: bool = False
