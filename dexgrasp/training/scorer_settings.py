@@ -25,9 +25,9 @@ class ScorerSettings:
     most: int = 256
     hidden: tuple[int, ...] = (256, 128)
     around: tuple[int, ...] = (32, 64)
-    sweep: tuple[float, ...] = ()
-    along: tuple[float, ...] = (0.0,)
-    extent: bool = False
+    sweep: tuple[float, ...] = (-0.12, 0.0, 0.1, 0.2)
+    along: tuple[float, ...] = (0.0, 0.5, 1.0)
+    extent: bool = True
     upright: float = 0.0
     raised: float = 0.0
     per_view: int = 200
