@@ -22,7 +22,7 @@ class ScorerSettings:
     taught: bool = True
     anew: bool = False
     choices: int = 3
-    most: int = 256
+    most: int = 160
     hidden: tuple[int, ...] = (256, 128)
     around: tuple[int, ...] = (32, 64)
     sweep: tuple[float, ...] = (-0.12, 0.0, 0.1, 0.2)
