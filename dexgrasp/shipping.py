@@ -133,12 +133,7 @@ def _card(
         )
     yield from ("", "## How it was made", "")
     yield f"- dexgrasp {dexgrasp.__version__}, shipped from commit {source}; torch {torch.__version__}"
-    facts = notes.get("facts", {})
-    yield f"- seed {facts.get('seed', 'not known')}, {facts.get('steps', 'an unknown number of')} steps"
-    overrides = run / ".hydra" / "overrides.yaml"
-    if overrides.is_file():
-        words = [re.sub(r"=/[^\s,\]]+", "=DIR", str(word)) for word in OmegaConf.load(overrides)]
-        yield f"- `python -m dexgrasp train {' '.join(words)}`".rstrip("` ") + "`"
+    yield from _told(run, notes)
     yield from before["How it was made"]
     yield from ("", "## Data and licences", "")
     yield from _data(config) if isinstance(config, DictConfig) else ["Not known: no config lies beside the weights."]
@@ -151,18 +146,36 @@ def _card(
         yield from ("", "## Config", "", "```yaml", told, "```")
 
 
+def _told(run: Path, notes: Mapping[str, Any]) -> Iterator[str]:
+    """Yield seed, steps and command of a training."""
+    facts = notes.get("facts", {})
+    yield f"- seed {facts.get('seed', 'not known')}, {facts.get('steps', 'an unknown number of')} steps"
+    overrides = run / ".hydra" / "overrides.yaml"
+    if overrides.is_file():
+        words = [re.sub(r"=/[^\s,\]]+", "=DIR", str(word)) for word in OmegaConf.load(overrides)]
+        yield f"- `python -m dexgrasp train {' '.join(words)}`".rstrip("` ") + "`"
+
+
 def _before(config: Any) -> dict[str, list[str]]:
-    """Return what the card of the shipped weights that a training began with says of how they were made."""
+    """Return how the weights were made that a training began with: by their card, or by the files beside them."""
     told: dict[str, list[str]] = {"How it was made": [], "Data and licences": []}
     start = None if config is None else config.get("init_from")
     if start is None:
         return told
-    card = WEIGHTS / f"{start}.md"
-    if not card.is_file():
-        told["How it was made"] = ["- it began with another training, whose card is its own"]
-        return told
     # Of a scorer that was taught anew nothing is left: the network alone counts, and what that began with.
     alone = OmegaConf.select(config, "trainer.steps") == 0 and bool(OmegaConf.select(config, "scorer.anew"))
+    card, run = WEIGHTS / f"{start}.md", Path(start)
+    if not card.is_file():
+        told["How it was made"] = ["- it began with another training, whose card is its own"]
+        if (run / FILE).is_file() and (run / "config.yaml").is_file():
+            began = ["", f"{BEGAN}, {'the network of ' if alone else ''}another training:", ""]
+            its = OmegaConf.load(run / "config.yaml")
+            data = _data(its) if isinstance(its, DictConfig) else []
+            told = {
+                "How it was made": [*began, *_told(run, read_tensors(run / FILE)[1])],
+                "Data and licences": [*began, *data],
+            }
+        return told
     for section in card.read_text().split("\n## ")[1:]:
         title, *lines = section.splitlines()
         if title in told:

@@ -119,16 +119,24 @@ def test_weights_load_by_name_and_carry_a_card(model, tmp_path, monkeypatch):
 
 def test_a_card_tells_what_its_weights_began_with(model, tmp_path, monkeypatch):
     monkeypatch.setattr(shipping, "WEIGHTS", tmp_path / "weights")
-    for name, start in (("first", None), ("second", "first"), ("third", "elsewhere")):
+    for name, start in (
+        ("first", None),
+        ("second", "first"),
+        ("third", "elsewhere"),
+        ("fourth", str(tmp_path / "first")),
+    ):
         run = tmp_path / name
         save_model(run / "model.safetensors", model, {"seed": 3, "steps": 7 if start is None else 0})
         objects = {"kind": "procedural", "split": "train", "seed": 5 if start is None else 6}
         OmegaConf.save(OmegaConf.create({"init_from": start, "dataset": {"objects": objects}}), run / "config.yaml")
         shipping.ship(run / "model.safetensors", name, tmp_path / "weights", views=2)
-    first, second, third = ((tmp_path / "weights" / f"{name}.md").read_text() for name in ("first", "second", "third"))
+    cards = ((tmp_path / "weights" / f"{name}.md").read_text() for name in ("first", "second", "third", "fourth"))
+    first, second, third, fourth = cards
     assert "began" not in first and "seed 6" not in first
     assert all(word in second for word in ("0 steps", "7 steps", "seed 5), ", "seed 6), ", "`first` as shipped before"))
     assert "another training" in third and "seed 5" not in third
+    assert all(word in fourth for word in ("another training:", "0 steps", "7 steps", "seed 5), ", "seed 6), "))
+    assert str(tmp_path) not in fourth
 
 
 def test_a_card_forgets_a_scorer_of_which_nothing_is_left(model, tmp_path, monkeypatch):
