@@ -35,6 +35,7 @@ def coarse_points(cloud: Float[Tensor, "N 6"], count: int = COARSE) -> Float[Ten
 
 
 Seen = tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F S 7"], Float[Tensor, "N E"]]
+"""What a scorer sees, as `look` returns it: points about the hands, nearest points on the fingers' way, extents."""
 
 
 def look(
