@@ -7,7 +7,7 @@ from numba import njit
 from torch import Tensor
 
 from dexgrasp.borrow import borrowed
-from dexgrasp.cells import BITS, Cells, find_cell, make_cells
+from dexgrasp.connected import connected
 from dexgrasp.grasps import Grasps
 from dexgrasp.segmentation import LOWEST
 
@@ -58,8 +58,8 @@ def things(points: np.ndarray) -> np.ndarray:
     thing = np.full(len(points), -1)
     above = np.flatnonzero(points[:, 2] > LOWEST)
     if len(above):
-        cells = make_cells(points[above], GAP)
-        thing[above] = above[_joined(cells)]
+        piece = connected(points[above].astype(np.float64), GAP)
+        thing[above] = above[np.unique(piece, return_index=True)[1][piece]]
     return thing
 
 
@@ -76,44 +76,6 @@ def things_reference(points: Float[Tensor, "Q _"]) -> Int[Tensor, "Q"]:
         thing = thing.scatter_reduce(0, thing, least, "amin")  # what hangs at a root goes along with it
         thing = thing[thing.minimum(least)]
     return torch.where(above, thing, -1)
-
-
-@njit(cache=True)
-def _joined(cells: Cells) -> np.ndarray:
-    """Return for each point the least row of those that it hangs together with (union-find)."""
-    points, side, low = cells.points, cells.side, cells.low
-    total = points.shape[1]
-    root = np.arange(total)
-    for i in range(total):
-        a, b, c = points[0, i], points[1, i], points[2, i]
-        u, v, w = int((a - low[0]) / side) + 1, int((b - low[1]) / side) + 1, int((c - low[2]) / side) + 1
-        one = cells.order[i]
-        for p in range(u - 1, u + 2):
-            for q in range(v - 1, v + 2):
-                for s in range(w - 1, w + 2):
-                    key = (p << 2 * BITS) | (q << BITS) | s
-                    slot = find_cell(cells.keys, key)
-                    if cells.keys[slot] != key:
-                        continue
-                    for n in range(cells.starts[slot], cells.stops[slot]):
-                        other = cells.order[n]
-                        if other >= one:
-                            continue
-                        e, f, g = points[0, n] - a, points[1, n] - b, points[2, n] - c
-                        if e * e + f * f + g * g < GAP * GAP:
-                            first, second = _root(root, one), _root(root, other)
-                            root[max(first, second)] = min(first, second)
-    for i in range(total):
-        root[i] = _root(root, i)
-    return root
-
-
-@njit(cache=True, inline="always")
-def _root(root: np.ndarray, i: int) -> int:
-    while root[i] != i:
-        root[i] = root[root[i]]  # halves the way for those who come next
-        i = root[i]
-    return i
 
 
 @njit(cache=True)
@@ -139,7 +101,9 @@ def _extents(pose: np.ndarray, at: np.ndarray, points: np.ndarray, thing: np.nda
         if told < 0:
             continue
         frame, count = pose[i], last[told] - first[told]
-        height = x[0] - x[0] - np.float32(np.inf)
+        height = -np.float32(np.inf)
+        for k in range(first[told], last[told]):
+            height = max(height, z[order[k]])
         for axis in range(3):
             u, v, w = frame[0, axis], frame[1, axis], frame[2, axis]
             shift = frame[0, 3] * u + frame[1, 3] * v + frame[2, 3] * w
@@ -149,7 +113,6 @@ def _extents(pose: np.ndarray, at: np.ndarray, points: np.ndarray, thing: np.nda
                 along = x[n] * u + y[n] * v + z[n] * w - shift
                 mean += along
                 least, largest = min(least, along), max(largest, along)
-                height = max(height, z[n])
             out[i, axis] = mean / count / REACH
             out[i, 3 + axis] = least / REACH
             out[i, 6 + axis] = largest / REACH
