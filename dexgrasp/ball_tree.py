@@ -10,6 +10,8 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
+from dexgrasp.link_shape import once_per_shape
+
 PROTRUSION = 3e-5
 """How far a ball may stand out of its part, m: what lets balls bridge the facets of a round surface."""
 
@@ -28,6 +30,12 @@ def inscribed(points: np.ndarray, normals: np.ndarray, sides: np.ndarray) -> np.
     slack = np.maximum(sides[:, 3] - points @ sides[:, :3].T, 0) + PROTRUSION
     slope = 1 - normals @ sides[:, :3].T
     return np.where(slope > 1e-9, slack / np.maximum(slope, 1e-9), np.inf).min(axis=1)
+
+
+@once_per_shape
+def inscribed_tree(parts: Sequence[trimesh.Trimesh], tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return `ball_tree` of `inscribed_balls`, (M, 4) and (M, 2)."""
+    return ball_tree(inscribed_balls(parts, tolerance))
 
 
 def inscribed_balls(parts: Sequence[trimesh.Trimesh], tolerance: float) -> np.ndarray:
@@ -63,19 +71,25 @@ def inscribed_balls(parts: Sequence[trimesh.Trimesh], tolerance: float) -> np.nd
 
 def _lattice(part: trimesh.Trimesh, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Return points on the faces of a mesh, rows at most `spacing` apart, and their face normals."""
-    points, normals = [], []
-    for triangle, normal in zip(part.triangles, part.face_normals, strict=True):
-        lengths = np.linalg.norm(np.roll(triangle, -1, axis=0) - triangle, axis=1)
-        start = int(lengths.argmin())
-        a, b, c = np.roll(triangle, -start, axis=0)  # the shortest edge is a-b
-        rows = int(np.ceil(max(np.linalg.norm(c - a), np.linalg.norm(c - b)) / spacing))
-        for row in range(rows + 1):
-            left, right = a + (c - a) * row / rows, b + (c - b) * row / rows
-            steps = int(np.ceil(np.linalg.norm(right - left) / spacing))
-            weights = np.linspace(0, 1, steps + 1)[:, None] if steps else np.zeros((1, 1))
-            points.append(left + (right - left) * weights)
-            normals.append(np.repeat(normal[None], len(points[-1]), axis=0))
-    return np.concatenate(points), np.concatenate(normals)
+    triangles = np.asarray(part.triangles)
+    start = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2).argmin(axis=1)
+    turned = (start[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(triangles, turned[..., None], axis=1).swapaxes(0, 1)  # the shortest edge is a-b
+    longest = np.maximum(np.linalg.norm(c - a, axis=1), np.linalg.norm(c - b, axis=1))
+    rows = np.ceil(longest / spacing).astype(int)
+    face, row = _counted(rows)
+    left, right = (end[face] + (c - end)[face] * row[:, None] / np.maximum(rows, 1)[face, None] for end in (a, b))
+    steps = np.ceil(np.linalg.norm(right - left, axis=1) / spacing).astype(int)
+    line, step = _counted(steps)
+    share = np.where(step < steps[line], step * (1 / np.maximum(steps, 1)[line]), 1.0)  # ends exactly
+    points = left[line] + (right - left)[line] * share[:, None]
+    return points, np.asarray(part.face_normals)[face[line]]
+
+
+def _counted(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return who counts, and the count, while each of `ends` (N,) in turn counts from 0 to itself."""
+    who = np.repeat(np.arange(len(ends)), ends + 1)
+    return who, np.arange(len(who)) - np.repeat(np.cumsum(ends + 1) - ends - 1, ends + 1)
 
 
 def ball_tree(leaves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ import trimesh
 from scipy.spatial import ConvexHull, cKDTree
 
 from dexgrasp.ball_tree import inscribed, planes
+from dexgrasp.link_shape import once_per_shape
 
 PIECE = 2.5e-3
 """Patches are made of pieces of faces, with edges of at most this, m."""
@@ -53,6 +54,7 @@ class Cover(NamedTuple):
     """(F, M) bound of the acceleration of these points at a constant closing speed."""
 
 
+@once_per_shape
 def link_cover(parts: Sequence[trimesh.Trimesh]) -> tuple[Cover, list[np.ndarray]]:
     """Cover the surface of a union of convex parts; return the tree and the points (K, 3) of the patch in each leaf."""
     sides = [planes(part) for part in parts]

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from dexgrasp.ball_tree import ball_tree, inscribed_balls, planes
+from dexgrasp.ball_tree import inscribed_tree, planes
 from dexgrasp.cover import Cover
 from dexgrasp.errors import DexgraspError
 from dexgrasp.hand import Hand
@@ -97,8 +97,7 @@ def _compile(hand: UrdfHand, coarseness: float) -> HandBody:
         if not hand.collisions.get(name):
             continue
         tolerance = TIP_TOLERANCE if any(finger.link == name for finger in hand.fingers) else TOLERANCE
-        leaves = inscribed_balls(hand.collisions[name], coarseness * tolerance)
-        nodes, below = ball_tree(leaves)
+        nodes, below = inscribed_tree(hand.collisions[name], coarseness * tolerance)
         roots[link] = count
         balls.append(nodes)
         children.append(np.where(below < 0, -1, below + count))

@@ -20,7 +20,6 @@ def hand_cover(
     rates: np.ndarray,
 ) -> Cover:
     """Cover those links that fingers move: by full joints' velocities (F, M), within limits (M, 2)."""
-    known: dict[bytes, tuple[Cover, list[np.ndarray]]] = {}  # the fingers of a hand are often alike
     trees: list[Cover] = []
     roots, moving = np.full(len(links), -1), np.zeros(len(links), dtype=bool)
     count = first = total = 0
@@ -29,10 +28,7 @@ def hand_cover(
         moving[number] |= link.index >= 0 and bool(rates[:, link.index].any())
         bodies = parts.get(link.name, ())
         if bodies and moving[number]:
-            key = b"".join(np.asarray(part.vertices).tobytes() for part in bodies)
-            if key not in known:
-                known[key] = link_cover(bodies)
-            tree, surface = known[key]
+            tree, surface = link_cover(bodies)
             cuts = np.cumsum([len(points) for points in surface])[:-1]
             of_centers, of_points = (
                 np.array([_speeds(points, number, links, limits, rate) for rate in rates])

@@ -37,6 +37,15 @@ if not torch.cuda.is_available():  # before Triton is imported: its kernels then
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put files with slow tests first in each half: two workers begin with them and share small ones at the end."""
+    slow = list(dict.fromkeys(item.path for item in items if item.get_closest_marker("slow")))
+    early, late = ([item for item in items if item.path in slow[half::2]] for half in (0, 1))
+    other = [item for item in items if item.path not in slow]
+    half = max(0, len(items) // 2 - len(early))
+    items[:] = [*early, *other[:half], *late, *other[half:]]
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder of golden values and real meshes beside the checkout."""
