@@ -168,23 +168,28 @@ def procedural(
     stretch: float = 1.0,
     thickness: tuple[float, float] | None = None,
     suffix: str = "",
+    families: Sequence[str] | None = None,
 ) -> ObjectSet:
     """Return embedded shapes; `count` null gives the split's default number. Same arguments, same shapes.
 
     A shape follows from the seed, its family and its number alone. The test split holds other draws of every
-    training family, and families that training never sees. `size`, `stretch`, `thickness` and `suffix` as in `shape`.
+    training family, and families that training never sees; `families` takes these alone of a split. `size`, `stretch`,
+    `thickness` and `suffix` as in `shape`.
     """
     from dexgrasp.shapes import FAMILIES, HELD_OUT  # reading objects needs no solid modeller
 
     if split not in SPLITS:
         raise DexgraspError(f"objects.split to be one of {SPLITS}", repr(split), "set objects.split")
     if split == "all":
-        halves = [procedural(half, count, seed, size, stretch, thickness, suffix) for half in ("train", "test")]
+        rest = (count, seed, size, stretch, thickness, suffix, families)
+        halves = [procedural(half, *rest) for half in ("train", "test")]
         return ObjectSet(f"procedural-all-{seed}", (*halves[0], *halves[1]))
-    families = FAMILIES if split == "train" else HELD_OUT | FAMILIES
-    count = (3 * len(FAMILIES) if split == "train" else len(families)) if count is None else count
+    makers = FAMILIES if split == "train" else HELD_OUT | FAMILIES
+    names = list(makers if families is None else families)
+    if unknown := [name for name in names if name not in makers] or ["none"] * (not names):
+        raise DexgraspError(f"objects.families of split {split}", ", ".join(unknown), f"take some of {sorted(makers)}")
+    count = (3 if split == "train" else 1) * len(names) if count is None else count
     start = 0 if split == "train" else FIRST_TEST_NUMBER
-    names = list(families)
     drawn = [(names[i % len(names)], start + i // len(names)) for i in range(count)]
     objects = tuple(shape(family, number, seed, size, stretch, thickness, suffix) for family, number in drawn)
     return ObjectSet(f"procedural-{split}-{seed}", objects)

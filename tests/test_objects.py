@@ -102,6 +102,16 @@ def test_flat_shapes_have_the_thickness_that_is_drawn() -> None:
         procedural("train", 1, thickness=(0.02, 0.01))
 
 
+def test_shapes_of_some_families_are_the_same_as_among_all() -> None:
+    every, some = procedural("train", 64), procedural("train", 4, families=["bottle", "box"])
+    assert some.names == ("bottle_000", "box_000", "bottle_001", "box_001")
+    assert all(np.array_equal(item.mesh.vertices, every[item.name].mesh.vertices) for item in some)
+    assert len(procedural("train", families=["box"])) == 3 and len(procedural("test", families=["carton"])) == 1
+    for wrong in (["carton"], []):  # held out
+        with pytest.raises(DexgraspError, match=r"objects\.families"):
+            procedural("train", 1, families=wrong)
+
+
 def test_several_sets_are_one() -> None:
     one, other = ({"kind": "procedural", "split": split, "count": 2} for split in ("train", "test"))
     both = load_objects({"kind": "several", "sets": {"a": one, "b": other}})
