@@ -1,8 +1,13 @@
-"""The device that a config names."""
+"""The device that a config names, and what may run there."""
 
 import torch
 
 from dexgrasp.errors import DexgraspError
+
+
+def takes_compiled(values: torch.Tensor) -> bool:
+    """Return whether compiled code may stand in for plain torch: single precision on a CPU, and nothing traces."""
+    return values.device.type == "cpu" and values.dtype == torch.float32 and not torch.compiler.is_compiling()
 
 
 def find_device(name: str | torch.device, key: str) -> torch.device:

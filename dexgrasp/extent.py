@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dexgrasp.borrow import borrowed
 from dexgrasp.connected import connected
+from dexgrasp.device import takes_compiled
 from dexgrasp.grasps import Grasps
 from dexgrasp.segmentation import LOWEST
 
@@ -27,8 +28,7 @@ def extents(grasps: Grasps, at: Float[Tensor, "N 6"], points: Float[Tensor, "Q 6
     the one nearest to `at`, above the table. Zeros where a grasp is told at the table.
     """
     points, at = points.to(grasps.pose), at.to(grasps.pose)
-    compiled = at.device.type == "cpu" and at.dtype == torch.float32 and not torch.compiler.is_compiling()
-    if not compiled or grasps.pose.requires_grad:
+    if not takes_compiled(at) or grasps.pose.requires_grad:
         return extents_reference(grasps.pose, at, points)
     pose, told, where = (part.detach().contiguous().numpy() for part in (grasps.pose, at, points[:, :3]))
     out = torch.empty(len(pose), NUMBERS)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dexgrasp.borrow import borrowed
 from dexgrasp.cells import BITS, Cells, find_cell, make_cells
+from dexgrasp.device import takes_compiled
 from dexgrasp.execution import closing_direction
 from dexgrasp.extent import extents
 from dexgrasp.geometry import transform
@@ -103,8 +104,7 @@ def _seen(
     middle: Float[Tensor, "N 3"], frame: Float[Tensor, "N 4 4"], points: Float[Tensor, "Q 6"], count: int, reach: float
 ) -> Float[Tensor, "N K 7"]:
     count = min(count, len(points))
-    compiled = frame.device.type == "cpu" and frame.dtype == torch.float32 and not torch.compiler.is_compiling()
-    quick = compiled and not frame.requires_grad
+    quick = takes_compiled(frame) and not frame.requires_grad
     return (_compiled if quick else around_reference)(middle, frame, points, count, reach)
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from numba import njit
 from torch import Tensor
 
+from dexgrasp.device import takes_compiled
 from dexgrasp.geometry import inverse
 from dexgrasp.hand import Finger, Hand
 
@@ -41,8 +42,7 @@ class TipSurface:
         smoothed over and a flat that faces the direction touches with its middle.
         """
         found = torch.empty_like(directions)
-        compiled = directions.device.type == "cpu" and directions.dtype == torch.float32
-        compiled = compiled and not (directions.requires_grad or torch.compiler.is_compiling())
+        compiled = takes_compiled(directions) and not directions.requires_grad
         for index, ((corners, points), radius) in enumerate(zip(self.tips, self.radii, strict=True)):
             rows = (finger == index).nonzero().flatten()
             towards = directions[rows]

@@ -10,13 +10,16 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from dexgrasp.device import takes_compiled
+
 
 def interpolated(
     rows: Float[Tensor, "M C"], nearest: Int[Tensor, "N K"], weights: Float[Tensor, "N K"]
 ) -> Float[Tensor, "N C"]:
     """Return out[n] = sum over k of weights[n, k] rows[nearest[n, k]]; weights have no gradient."""
-    compiled = rows.device.type == "cpu" and rows.dtype == torch.float32 and not torch.compiler.is_compiling()
-    return _Interpolated.apply(rows, nearest, weights) if compiled else interpolated_reference(rows, nearest, weights)
+    if takes_compiled(rows):
+        return _Interpolated.apply(rows, nearest, weights)
+    return interpolated_reference(rows, nearest, weights)
 
 
 def interpolated_reference(

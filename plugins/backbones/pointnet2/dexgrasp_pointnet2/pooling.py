@@ -10,13 +10,15 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from dexgrasp.device import takes_compiled
+
 
 def ball_max(rows: Float[Tensor, "N C"], group: Int[Tensor, "M K"]) -> Float[Tensor, "M C"]:
     """Return out[m, c] = max over k of rows[group[m, k], c]; the gradient goes to the first that reaches it.
 
     Groups padded by their first row (see `dexgrasp.sampling.neighbours`) cost no more than what they hold.
     """
-    if rows.device.type != "cpu" or rows.dtype != torch.float32 or torch.compiler.is_compiling():
+    if not takes_compiled(rows):
         return ball_max_reference(rows, group)
     if torch.is_grad_enabled() and rows.requires_grad:
         return _BallMax.apply(rows, group)
