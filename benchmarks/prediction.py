@@ -84,7 +84,7 @@ def stages(model: GraspNet, points: np.ndarray) -> dict[str, float]:
     if judge is not None:
         answers = len(told) // len(rows)
         at = level[chosen].repeat(answers, 1)
-        score = judge(rows, at, told, *judge.look(told, at, level[seeds[: judge.spread]]))
+        score = judge(rows, at, told, *judge.look(told, level[seeds[: judge.spread]]))
         told = told.replace(quality=score.sigmoid())
         lap("scorer")
     grasps = told.moved(inverse(level_T_camera))

@@ -1,5 +1,6 @@
 """GraspNet: a backbone and a representation; from points to grasps."""
 
+import inspect
 import json
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -151,7 +152,7 @@ class GraspNet(nn.Module):
             coarse = every[: scorer.spread]
         spread = coarse_points(cloud, scorer.spread) if coarse is None else cloud[coarse]
         at = cloud[seeds].repeat(answers, 1)
-        return grasps.replace(quality=scorer(features, at, grasps, *scorer.look(grasps, at, spread)).sigmoid())
+        return grasps.replace(quality=scorer(features, at, grasps, *scorer.look(grasps, spread)).sigmoid())
 
     def predict(
         self,
@@ -245,6 +246,9 @@ def load_model(
     model = build_model(notes["config"], notes["points"], hand)
     check_hand(model.hand, notes["hand"], path)
     if notes.get("scorer") is not None:
+        if strange := notes["scorer"].keys() - inspect.signature(Scorer).parameters.keys():
+            remedy = "take the version that made them, or train anew"
+            raise DexgraspError(f"a scorer of this version in {path}", f"one with {', '.join(strange)}", remedy)
         model.scorer = Scorer(model.hand, model.backbone.channels, **notes["scorer"])
     load_state(model, tensors, path)
     model.precision, model.captured = precision, Captured(model) if captured else None

@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dexgrasp.extent import NUMBERS
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
 from dexgrasp.heads import Layers, mlp
@@ -39,7 +38,6 @@ class Scorer(nn.Module):
         sweep: where on its way each fingertip looks for the nearest point, see `dexgrasp.surroundings.swept`; none: it
             does not.
         along: at which places of the distal link it does so, likewise.
-        extent: it is told where the thing lies from the hand and how far it reaches, see `dexgrasp.extent.extents`.
         upright: what was done to the grasps whose outcome it has learnt, see `dexgrasp.selection.Selection`, rad.
         raised: likewise, m.
     """
@@ -54,7 +52,6 @@ class Scorer(nn.Module):
         around: Sequence[int] = (32, 64),
         sweep: Sequence[float] = (),
         along: Sequence[float] = (0.0,),
-        extent: bool = False,
         upright: float = 0.0,
         raised: float = 0.0,
     ) -> None:
@@ -67,7 +64,6 @@ class Scorer(nn.Module):
             "around": list(around),
             "sweep": list(sweep),
             "along": list(along),
-            "extent": extent,
             "upright": upright,
             "raised": raised,
         }
@@ -75,15 +71,14 @@ class Scorer(nn.Module):
         self.sweep, self.along = tuple(sweep), tuple(along)
         met = 7 * len(sweep) * len(along)
         self.way = nn.Sequential(nn.Linear(met, WAY[0]), nn.ReLU(), nn.Linear(*WAY), nn.ReLU()) if sweep else None
-        self.extent = extent
-        self.spread = FINE if sweep or extent else COARSE
+        self.spread = FINE if sweep else COARSE
         """Number of `coarse_points` at which it looks."""
-        felt = len(hand.fingers) * (WAY[-1] if sweep else 0) + (NUMBERS if extent else 0)
+        felt = len(hand.fingers) * WAY[-1] if sweep else 0
         self.layers = mlp(channels + around[-1] + felt + 13 + len(hand.joint_names), hidden, 1)
 
-    def look(self, grasps: Grasps, at: Float[Tensor, "N 6"], points: Float[Tensor, "Q 6"]) -> Seen:
-        """Return what it sees of a scene's `coarse_points`, `self.spread` of them; `at` as for `forward`."""
-        return look(self.hand, grasps, at, points, self.sweep, self.along, self.extent)
+    def look(self, grasps: Grasps, points: Float[Tensor, "Q 6"]) -> Seen:
+        """Return what it sees of a scene's `coarse_points`, `self.spread` of them."""
+        return look(self.hand, grasps, points, self.sweep, self.along)
 
     def forward(
         self,
@@ -92,7 +87,6 @@ class Scorer(nn.Module):
         grasps: Grasps,
         around: Float[Tensor, "N K 7"],
         swept: Float[Tensor, "N F S 7"],
-        extent: Float[Tensor, "N E"],
     ) -> Float[Tensor, "N"]:
         """Return N logits; `at` is point (m) and normal where each grasp is told, level frame; the rest is of `look`.
 
@@ -104,7 +98,6 @@ class Scorer(nn.Module):
         seen = [near, offset, turned, at[:, 3:], at[:, 2:3] / REACH, grasps.joints]
         if self.way is not None:
             seen.append(self.way(swept.to(features).flatten(2)).flatten(1))
-        seen.append(extent)
         own = torch.cat([part.to(features) for part in seen], dim=1)
         return self.layers(features, own).squeeze(1)
 

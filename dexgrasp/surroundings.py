@@ -12,7 +12,6 @@ from dexgrasp.borrow import borrowed
 from dexgrasp.cells import BITS, Cells, find_cell, make_cells
 from dexgrasp.device import takes_compiled
 from dexgrasp.execution import closing_direction
-from dexgrasp.extent import extents
 from dexgrasp.geometry import transform
 from dexgrasp.grasps import Grasps
 from dexgrasp.hand import Hand
@@ -35,26 +34,19 @@ def coarse_points(cloud: Float[Tensor, "N 6"], count: int = COARSE) -> Float[Ten
     return cloud[farthest_points(cloud[:, :3], min(count, len(cloud)))]
 
 
-Seen = tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F S 7"], Float[Tensor, "N E"]]
-"""What a scorer sees, as `look` returns it: points about the hands, nearest points on the fingers' way, extents."""
+Seen = tuple[Float[Tensor, "N K 7"], Float[Tensor, "N F S 7"]]
+"""What a scorer sees, as `look` returns it: points about the hands, nearest points on the fingers' way."""
 
 
 def look(
     hand: Hand,
     grasps: Grasps,
-    at: Float[Tensor, "N 6"],
     points: Float[Tensor, "Q 6"],
     sweep: Sequence[float] = (),
     along: Sequence[float] = (0.0,),
-    extent: bool = False,
 ) -> Seen:
-    """Return `surroundings` among the first of a scene's `coarse_points` and `swept` among all of them.
-
-    And, with `extent`, the `dexgrasp.extent.extents` of the things `at` which the grasps are told, (N, 0) without.
-    """
-    near = surroundings(hand, grasps, points[:COARSE])
-    thing = extents(grasps, at, points) if extent else grasps.pose.new_zeros(len(grasps), 0)
-    return near, swept(hand, grasps, points, sweep, along), thing
+    """Return `surroundings` among the first of a scene's `coarse_points` and `swept` among all of them."""
+    return surroundings(hand, grasps, points[:COARSE]), swept(hand, grasps, points, sweep, along)
 
 
 def surroundings(hand: Hand, grasps: Grasps, points: Float[Tensor, "Q 6"]) -> Float[Tensor, "N K 7"]:

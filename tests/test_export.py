@@ -74,7 +74,6 @@ def test_a_scorer_that_follows_fingers_is_exported(model, tmp_path):
         most=100,
         sweep=(-0.1, 0.1),
         along=(0.0, 1.0),
-        extent=True,
     ).eval()
     views = [view[: 2300 + 100 * number] for number, view in enumerate(level_views(wide, 2))]
     graph = trace(wide, views[0], "grasps")

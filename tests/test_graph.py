@@ -34,7 +34,6 @@ def network(representation: str, hand: str = "barrett") -> GraspNet:
         most=40,
         sweep=(-0.1, 0.1),
         along=(0.0, 1.0),
-        extent=True,
     )
     return model.eval()
 

@@ -8,6 +8,7 @@ import dexgrasp
 from dexgrasp.errors import DexgraspError
 from dexgrasp.geometry import rotation_angle
 from dexgrasp.model import GraspNet, build_model, load_model, save_model
+from dexgrasp.scorer import Scorer
 from dexgrasp.selection import Selection
 from dexgrasp.testing.samples import seen
 
@@ -133,3 +134,12 @@ def test_load_refuses_another_hand_and_other_weights(model, tmp_path, monkeypatc
             load_model(path)
     finally:
         model.config["backbone"] = BACKBONE
+
+
+def test_load_says_which_of_a_scorers_options_are_gone(model, tmp_path, monkeypatch):
+    path = tmp_path / "model.safetensors"
+    monkeypatch.setattr(model, "scorer", Scorer(model.hand, model.backbone.channels))
+    monkeypatch.setitem(model.scorer.options, "tips", 16)
+    save_model(path, model)
+    with pytest.raises(DexgraspError, match=r"(?s)a scorer of this version.*tips"):
+        load_model(path)

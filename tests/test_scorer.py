@@ -120,11 +120,11 @@ def test_a_scene_turned_about_the_vertical_looks_the_same_to_the_hand(hand):
 def test_a_scorer_tells_by_what_its_fingers_meet(hand):
     """In pieces in evaluation as all at once in training's way; it tells otherwise where other points are."""
     torch.manual_seed(0)
-    scorer = Scorer(hand, 8, sweep=(-0.1, 0.2), along=(0.0, 0.6), extent=True).eval()
+    scorer = Scorer(hand, 8, sweep=(-0.1, 0.2), along=(0.0, 0.6)).eval()
     grasps, points = some(hand, 300), coarse_points(cloud(3000), FINE)
     given = torch.randn(300, 8), torch.randn(300, 6), grasps
-    around, on_way, extent = scorer.look(grasps, given[1], points)
-    told = scorer(*given, around, on_way, extent)
+    around, on_way = scorer.look(grasps, points)
+    told = scorer(*given, around, on_way)
     with torch.no_grad():
         near = scorer.around(around.flatten(0, 1)).unflatten(0, (300, -1)).amax(dim=1)
         offset = (grasps.pose[:, :3, 3] - given[1][:, :3]) / 0.1
@@ -136,14 +136,12 @@ def test_a_scorer_tells_by_what_its_fingers_meet(hand):
             given[1][:, 2:3] / 0.1,
             grasps.joints,
             scorer.way(on_way.flatten(2)).flatten(1),
-            extent,
         ]
         expected = scorer.layers(torch.cat([given[0], *own], dim=1)).squeeze(1)
     torch.testing.assert_close(told, expected, atol=1e-5, rtol=1e-5)
-    assert not torch.allclose(scorer(*given, around, on_way.flip(0), extent), told)
-    assert not torch.allclose(scorer(*given, around, on_way, extent.flip(0)), told)
+    assert not torch.allclose(scorer(*given, around, on_way.flip(0)), told)
     blind = Scorer(hand, 8)
-    assert blind.spread == COARSE and scorer.spread == FINE and blind.look(grasps, given[1], points)[1].shape[2] == 0
+    assert blind.spread == COARSE and scorer.spread == FINE and blind.look(grasps, points)[1].shape[2] == 0
 
 
 def test_few_points_are_enough(hand):
@@ -337,7 +335,7 @@ def test_calibration_makes_probabilities_come_true_and_keeps_the_order(hand):
         assert slope > 0 and math.isfinite(shift)
     scorer, grasps = Scorer(hand, 8).eval(), some(hand, 64)
     at = torch.randn(64, 6)
-    given = torch.randn(64, 8), at, grasps, *scorer.look(grasps, at, coarse_points(cloud()))
+    given = torch.randn(64, 8), at, grasps, *scorer.look(grasps, coarse_points(cloud()))
     before = scorer(*given).detach()
     came = torch.bernoulli((before - before.mean()).sigmoid())
     slope, shift = platt(before, came)

@@ -50,8 +50,6 @@ class Proposals(Batch):
     """What lies about the hand, see `dexgrasp.surroundings.surroundings`; half precision."""
     swept: Float[Tensor, "N F S 7"]
     """What is nearest to its fingers on their way, see `dexgrasp.surroundings.swept`; half precision."""
-    extent: Float[Tensor, "N E"]
-    """Of the thing at which it is told, see `dexgrasp.extent.extents`; half precision."""
     score: Float[Tensor, "N"]
     """Probability of graspable as the heads tell it."""
     facts: Float[Tensor, "N K"]
@@ -105,7 +103,7 @@ def _of_view(
     if own:
         assert model.scorer is not None
         at = cloud[seeds].repeat(len(told), 1)
-        score = model.scorer(features, at, grasps, *model.scorer.look(grasps, at, coarse))
+        score = model.scorer(features, at, grasps, *model.scorer.look(grasps, coarse))
         rows = _best(model, done.replace(quality=score.sigmoid()), coarse, settings)
     else:
         order = torch.from_numpy(stream(seed, "proposals", index).permutation(len(grasps)))
@@ -120,12 +118,11 @@ def _of_view(
     worth = torch.where(found.clear, torch.tensor(settings.clear)[kind], torch.tensor(settings.blocked)[kind])
     holds = found.clear & (held >= max(truth.settings.capacity, 1.0))
     where = cloud[seeds[at]]
-    seen = look(hand, grasps, where, coarse, settings.sweep, settings.along, settings.extent)
-    around, swept, extent = (part.half() for part in seen)
+    around, swept = (part.half() for part in look(hand, grasps, coarse, settings.sweep, settings.along))
     lifted = torch.full_like(worth, torch.nan)
     tried = len(grasps) if own else settings.verdicts
     lifted[:tried] = _executed(dataset, view, done[:tried], index, settings.protocol)
-    told_by = features[at], where, grasps.pose, grasps.joints, around, swept, extent, grasps.quality
+    told_by = features[at], where, grasps.pose, grasps.joints, around, swept, grasps.quality
     return Proposals(*told_by, facts(hand, done, found), worth, lifted, holds)
 
 

@@ -11,7 +11,7 @@ from dexgrasp.scorer import Scorer
 from dexgrasp.settings import read
 from dexgrasp.simulation.protocol import load_protocol
 
-FROM_START = ("most", "choices", "hidden", "around", "sweep", "along", "extent", "upright", "raised")
+FROM_START = ("most", "choices", "hidden", "around", "sweep", "along", "upright", "raised")
 """What, left open, is as the scorer has it that one begins with."""
 
 
@@ -27,7 +27,6 @@ class ScorerSettings:
     around: tuple[int, ...] = (32, 64)
     sweep: tuple[float, ...] = (-0.12, 0.0, 0.1, 0.2)
     along: tuple[float, ...] = (0.0, 0.5, 1.0)
-    extent: bool = True
     upright: float = 0.0
     raised: float = 0.0
     per_view: int = 200

@@ -167,7 +167,7 @@ def _fit(scorer: Scorer, known: Proposals, settings: ScorerSettings, seed: int) 
 
 
 def _seen(known: Proposals) -> Seen:
-    return known.around, known.swept, known.extent
+    return known.around, known.swept
 
 
 def _grasps(known: Proposals) -> Grasps:
