@@ -185,7 +185,7 @@ def procedural(
         halves = [procedural(half, *rest) for half in ("train", "test")]
         return ObjectSet(f"procedural-all-{seed}", (*halves[0], *halves[1]))
     makers = FAMILIES if split == "train" else HELD_OUT | FAMILIES
-    names = list(makers if families is None else families)
+    names = list(dict.fromkeys(makers if families is None else families))
     if unknown := [name for name in names if name not in makers] or ["none"] * (not names):
         raise DexgraspError(f"objects.families of split {split}", ", ".join(unknown), f"take some of {sorted(makers)}")
     count = (3 if split == "train" else 1) * len(names) if count is None else count

@@ -107,6 +107,7 @@ def test_shapes_of_some_families_are_the_same_as_among_all() -> None:
     assert some.names == ("bottle_000", "box_000", "bottle_001", "box_001")
     assert all(np.array_equal(item.mesh.vertices, every[item.name].mesh.vertices) for item in some)
     assert len(procedural("train", families=["box"])) == 3 and len(procedural("test", families=["carton"])) == 1
+    assert procedural("train", 2, families=["box", "box"]).names == ("box_000", "box_001")
     for wrong in (["carton"], []):  # held out
         with pytest.raises(DexgraspError, match=r"objects\.families"):
             procedural("train", 1, families=wrong)
