@@ -135,17 +135,10 @@ def _compile(hand: UrdfHand, coarseness: float) -> HandBody:
         vertices=np.concatenate([part.vertices for _, part in bodies]),
         vertex_links=np.concatenate([np.full(len(part.vertices), link) for link, part in bodies]),
         rates=rates,
-        cover=_cover(hand, limits, rates @ matrix.T),
+        cover=hand_cover(hand.tree, hand.collisions, limits, rates @ matrix.T),
         tip_links=np.array([names.index(finger.link) for finger in hand.fingers]),
         tips=np.array([[*f.tip_center.tolist(), *f.closing_axis.tolist(), f.tip_radius] for f in hand.fingers]),
     )
-
-
-def _cover(hand: UrdfHand, limits: np.ndarray, rates: np.ndarray) -> Cover:
-    """Cover a hand's links; the result is kept with it."""
-    if "_cover" not in hand.__dict__:
-        hand.__dict__["_cover"] = hand_cover(hand.tree, hand.collisions, limits, rates)
-    return hand.__dict__["_cover"]
 
 
 @njit(cache=True, error_model="numpy")

@@ -1,13 +1,13 @@
 """What is computed of a link's collision geometry alone, once for all links and hands of this process that have it."""
 
-import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Concatenate, ParamSpec, TypeVar
 
-import numpy as np
 import trimesh
+
+from dexgrasp.convex import mesh_hash
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -26,7 +26,7 @@ def once_per_shape(compute: Callable[Concatenate[Parts, P], T]) -> Callable[Conc
 
     @wraps(compute)
     def remembered(parts: Parts, *arguments: P.args, **options: P.kwargs) -> T:
-        key = _digest(parts), arguments, tuple(sorted(options.items()))
+        key = tuple(map(mesh_hash, parts)), arguments, tuple(sorted(options.items()))
         if key not in known:
             known[key] = compute(parts, *arguments, **options)
             if len(known) > KEPT:
@@ -34,11 +34,3 @@ def once_per_shape(compute: Callable[Concatenate[Parts, P], T]) -> Callable[Conc
         return known[key]
 
     return remembered
-
-
-def _digest(parts: Parts) -> bytes:
-    digest = hashlib.blake2b()
-    for part in parts:
-        for array in (np.asarray(part.vertices), np.asarray(part.faces)):
-            digest.update(repr(array.shape).encode() + array.tobytes())
-    return digest.digest()

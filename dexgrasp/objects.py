@@ -186,8 +186,10 @@ def procedural(
         return ObjectSet(f"procedural-all-{seed}", (*halves[0], *halves[1]))
     makers = FAMILIES if split == "train" else HELD_OUT | FAMILIES
     names = list(dict.fromkeys(makers if families is None else families))
-    if unknown := [name for name in names if name not in makers] or ["none"] * (not names):
-        raise DexgraspError(f"objects.families of split {split}", ", ".join(unknown), f"take some of {sorted(makers)}")
+    unknown = [name for name in names if name not in makers]
+    if unknown or not names:
+        found = ", ".join(unknown) or "none"
+        raise DexgraspError(f"objects.families of split {split}", found, f"take some of {sorted(makers)}")
     count = (3 if split == "train" else 1) * len(names) if count is None else count
     start = 0 if split == "train" else FIRST_TEST_NUMBER
     drawn = [(names[i % len(names)], start + i // len(names)) for i in range(count)]

@@ -40,7 +40,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put files with slow tests first in each half: two workers begin with them and share small ones at the end."""
     slow = list(dict.fromkeys(item.path for item in items if item.get_closest_marker("slow")))
-    early, late = ([item for item in items if item.path in slow[half::2]] for half in (0, 1))
+    early, late = ([item for item in items if item.path in files] for files in (slow[::2], slow[1::2]))
     other = [item for item in items if item.path not in slow]
     half = max(0, len(items) // 2 - len(early))
     items[:] = [*early, *other[:half], *late, *other[half:]]

@@ -3,7 +3,8 @@
 import trimesh
 
 from dexgrasp import link_shape
-from dexgrasp.hand_body import hand_body
+from dexgrasp.ball_tree import inscribed_tree
+from dexgrasp.hand_body import TIP_TOLERANCE, hand_body
 from dexgrasp.link_shape import once_per_shape
 from dexgrasp.plugins import load_hand
 
@@ -29,5 +30,8 @@ def test_alike_parts_are_computed_once_and_others_anew(monkeypatch):
 
 
 def test_a_second_hand_shares_what_the_first_one_cost():
-    first, second = hand_body(load_hand("barrett")), hand_body(load_hand("barrett"))
+    hands = load_hand("barrett"), load_hand("barrett")
+    trees = [inscribed_tree(hand.collisions[hand.fingers[0].link], TIP_TOLERANCE) for hand in hands]
+    assert trees[0] is trees[1]
+    first, second = map(hand_body, hands)
     assert first is not second and all((a == b).all() for a, b in zip(first[:-3], second[:-3], strict=True))

@@ -34,7 +34,7 @@ def sets_of(fingers, count, rng):
         # Two hard fingers span 5-D; qhull takes seconds for many soft ones.
         torsion = rng.uniform(0.05, 0.5) if fingers == 2 or (fingers < 5 and rng.random() < 0.03) else 0.0
         friction, scale = rng.uniform(0.1, 1), rng.uniform(0.5, 2)
-        edges = int(rng.integers(4, 11, size=3).min())  # 4 to 10, rather few: qhull's time grows steeply with them
+        edges = int(rng.integers(4, 11, size=2).min())  # 4 to 10, rather few: qhull's time grows steeply with them
         yield wrenches(points[None], normals[None], points.mean(axis=0), scale, friction, edges, torsion)[0]
 
 
