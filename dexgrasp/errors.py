@@ -21,6 +21,10 @@ class DexgraspError(Exception):
         return type(self), (self.expected, self.found, self.remedy)  # or it could not come back from a worker
 
 
+class UnknownOptions(DexgraspError):
+    """Options that a plugin or a part of a model does not have, or lacks, whoever wrote them."""
+
+
 class UnsupportedHand(DexgraspError):
     """A representation that cannot tell the grasps of a hand, whatever its options."""
 

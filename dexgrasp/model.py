@@ -1,6 +1,5 @@
 """GraspNet: a backbone and a representation; from points to grasps."""
 
-import inspect
 import json
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -26,7 +25,7 @@ from dexgrasp.checkpoint import (
 )
 from dexgrasp.cloud import prepare
 from dexgrasp.device import find_device
-from dexgrasp.errors import DexgraspError
+from dexgrasp.errors import DexgraspError, UnknownOptions
 from dexgrasp.geometry import inverse
 from dexgrasp.graph import Captured
 from dexgrasp.grasps import Grasps
@@ -243,13 +242,22 @@ def load_model(
     tensors, notes = read_tensors(path)
     if hand is not None:
         check_hand(hand, notes["hand"], path)
-    model = build_model(notes["config"], notes["points"], hand)
+    model = _rebuilt(path, notes, hand)
     check_hand(model.hand, notes["hand"], path)
-    if notes.get("scorer") is not None:
-        if strange := notes["scorer"].keys() - inspect.signature(Scorer).parameters.keys():
-            remedy = "take the version that made them, or train anew"
-            raise DexgraspError(f"a scorer of this version in {path}", f"one with {', '.join(strange)}", remedy)
-        model.scorer = Scorer(model.hand, model.backbone.channels, **notes["scorer"])
     load_state(model, tensors, path)
     model.precision, model.captured = precision, Captured(model) if captured else None
     return model.to(where).eval()
+
+
+def _rebuilt(path: Path, notes: Mapping[str, Any], hand: Hand | None) -> GraspNet:
+    """Return an untrained model of the parts that a checkpoint at `path` tells of."""
+    from dexgrasp.plugins import construct
+
+    try:
+        model = build_model(notes["config"], notes["points"], hand)
+        if notes.get("scorer") is not None:
+            model.scorer = construct(Scorer, notes["scorer"], model.hand, model.backbone.channels)
+    except UnknownOptions as error:  # its remedy is for the author of a YAML
+        remedy = "take the version of dexgrasp or of the plugin that made these weights, or train anew"
+        raise DexgraspError(f"in {path} {error.expected}", error.found, remedy) from error
+    return model

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dexgrasp.errors import DexgraspError
+from dexgrasp.errors import DexgraspError, UnknownOptions
 from dexgrasp.registry import GROUPS, conf_folder, conf_folders, find, installed, load_class, named, names, top_package
 
 if TYPE_CHECKING:
@@ -179,7 +179,7 @@ def resolved(kind: str, config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def construct(cls: type, options: dict[str, Any], *args: Any) -> Any:
-    """Return ``cls(*args, **options)``; raises DexgraspError for keys that it does not have, and for missing ones."""
+    """Return ``cls(*args, **options)``; raises UnknownOptions for keys that it does not have, and for missing ones."""
     parameters = inspect.signature(cls).parameters
     open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
     keywords = {key: value for key, value in options.items() if key != "name" or "name" in parameters}
@@ -188,7 +188,7 @@ def construct(cls: type, options: dict[str, Any], *args: Any) -> Any:
     if strange:
         close = difflib.get_close_matches(strange[0], known, n=1)
         hint = f"did you mean {close[0]!r}?" if close else "remove it"
-        raise DexgraspError(f"options of {cls.__name__}: {', '.join(known)}", repr(strange[0]), hint)
+        raise UnknownOptions(f"options of {cls.__name__}: {', '.join(known)}", repr(strange[0]), hint)
     required = [name for name in known if parameters[name].default is inspect.Parameter.empty]
     missing = [
         name
@@ -197,7 +197,7 @@ def construct(cls: type, options: dict[str, Any], *args: Any) -> Any:
         and parameters[name].kind not in (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
     ]
     if missing:
-        raise DexgraspError(
+        raise UnknownOptions(
             f"all of {', '.join(required)} for {cls.__name__}", f"no {', '.join(missing)}", "add it to the YAML"
         )
     return cls(*args, **keywords)

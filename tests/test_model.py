@@ -136,10 +136,11 @@ def test_load_refuses_another_hand_and_other_weights(model, tmp_path, monkeypatc
         model.config["backbone"] = BACKBONE
 
 
-def test_load_says_which_of_a_scorers_options_are_gone(model, tmp_path, monkeypatch):
+@pytest.mark.parametrize("part", ["Scorer", "PointNet2"])
+def test_load_says_which_options_of_a_part_are_gone(part, model, tmp_path, monkeypatch):
     path = tmp_path / "model.safetensors"
     monkeypatch.setattr(model, "scorer", Scorer(model.hand, model.backbone.channels))
-    monkeypatch.setitem(model.scorer.options, "tips", 16)
+    monkeypatch.setitem(model.scorer.options if part == "Scorer" else model.config["backbone"], "tips", 16)
     save_model(path, model)
-    with pytest.raises(DexgraspError, match=r"(?s)a scorer of this version.*tips"):
+    with pytest.raises(DexgraspError, match=rf"(?s){path} options of {part}.*'tips'.*that made these weights"):
         load_model(path)
