@@ -239,7 +239,9 @@ def shape(
 
 
 def _object(solid: "Solid", name: str, family: str, source: str) -> Object:
-    surface = solid.body.to_mesh64()
+    from dexgrasp.shapes.solid import closed
+
+    surface = closed(solid.body).to_mesh64()
     vertices, faces = np.asarray(surface.vert_properties)[:, :3], np.asarray(surface.tri_verts).astype(np.int64)
     centre = trimesh.Trimesh(vertices, faces, process=False).center_mass
     mesh = trimesh.Trimesh(vertices - centre, faces, process=False)

@@ -6,6 +6,7 @@ import pytest
 
 from dexgrasp.convex import deviation
 from dexgrasp.objects import ObjectSet, load_objects, shape
+from dexgrasp.seeds import stream
 from dexgrasp.shapes import FAMILIES, HELD_OUT
 
 EVERY = [*FAMILIES, *HELD_OUT]
@@ -36,6 +37,15 @@ def test_every_mesh_is_a_closed_body_of_household_size(train: ObjectSet, held_ou
         assert 0.018 <= item.mesh.extents.min() <= 0.12, item.name
         assert 200 <= len(item.mesh.faces) <= 6000, item.name
         assert np.allclose(item.com, 0, atol=1e-7), item.name
+
+
+def test_a_hull_with_folded_faces_is_closed() -> None:
+    body = HELD_OUT["wedge"](stream(11, "object", "wedge", 19)).body
+    faces = np.asarray(body.to_mesh64().tri_verts).astype(np.int64)
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+    assert np.unique(edges, axis=0, return_counts=True)[1].max() == 4  # so that this tests anything
+    item = shape("wedge", 19, seed=11)
+    assert item.mesh.is_volume and item.volume == pytest.approx(body.volume(), rel=1e-9)
 
 
 @pytest.mark.parametrize("family", EVERY)

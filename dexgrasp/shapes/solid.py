@@ -38,6 +38,14 @@ class Solid:
         return Solid(body, tuple(part * scale for part in self.parts))
 
 
+def closed(body: manifold3d.Manifold) -> manifold3d.Manifold:
+    """Return the body with two faces at every edge: of a hull two may lie folded onto others, at an edge of four."""
+    faces = np.asarray(body.to_mesh64().tri_verts).astype(np.int64)
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+    folded = (np.unique(edges, axis=0, return_counts=True)[1] != 2).any()
+    return body.simplify(0.0) if folded else body
+
+
 def octasphere(steps: int) -> Points:
     """Unit directions of a subdivided octahedron, 4 steps^2 + 2 of them, the axes among them."""
     grid = np.array([(a, b) for a in range(-steps, steps + 1) for b in range(-steps, steps + 1)])
